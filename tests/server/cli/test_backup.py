@@ -111,7 +111,7 @@ def test_a_damaged_backup_is_refused_and_leaves_the_store_alone(data, tmp_path):
         restore(tmp_path / "a.backup", data=data, overwrite=True)
     assert revisions(data) == 0
     (tmp_path / "a.backup").write_bytes(b"no backup")
-    with pytest.raises(BackupError, match="no backup of a worker"):
+    with pytest.raises(BackupError, match="not a worker's backup"):
         restore(tmp_path / "a.backup", data=data, overwrite=True)
 
 

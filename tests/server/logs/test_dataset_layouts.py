@@ -225,7 +225,7 @@ BAD_FOLDERS: dict[str, tuple[str, Callable[[Path], None], str]] = {
         _replace(f"{DRIVE}/tracklet_labels.xml", "<tx>", "<tx>nan</tx><tx>"),
         "tracklet 0: <tx> is not finite",
     ),
-    "no rotation": (
+    "not a rotation": (
         "kitti_raw",
         _replace("2011_09_26/calib_velo_to_cam.txt", "R:", "Q:"),
         r"calib_velo_to_cam\.txt: needs lines R",

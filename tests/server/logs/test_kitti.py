@@ -185,7 +185,7 @@ BAD_LAYOUTS: dict[str, tuple[Callable[[Path], None], str]] = {
     "no projection": (_replace("calib/0007.txt", "P2:", "P9:"), "no line P2:"),
     "calibration of words": (_replace("calib/0007.txt", "R_rect 1", "R_rect x"), "line 5.*number"),
     "skewed calibration": (
-        _replace("calib/0007.txt", "R_rect 1", "R_rect 3"), "no rotation matrix"
+        _replace("calib/0007.txt", "R_rect 1", "R_rect 3"), "not a rotation matrix"
     ),
     "no poses": (_remove("poses/0007.txt"), "neither .*poses.* nor .*oxts"),
     "empty poses": (_cut("poses/0007.txt", 0), r"poses/0007\.txt: is empty"),
@@ -193,8 +193,8 @@ BAD_LAYOUTS: dict[str, tuple[Callable[[Path], None], str]] = {
     "pose not finite": (
         _edit_row("poses/0007.txt", 1, lambda w: w.__setitem__(3, "nan")), "line 2: .*not finite"
     ),
-    "pose no rotation": (
-        _edit_row("poses/0007.txt", 2, lambda w: w.__setitem__(0, "2.0")), "line 3: .*no rotation"
+    "pose not a rotation": (
+        _edit_row("poses/0007.txt", 2, lambda w: w.__setitem__(0, "2.0")), "line 3: .*not a rotation"
     ),
     "pose missing": (_edit_row("poses/0007.txt", 2, lambda w: w.clear()), "holds 2 poses"),
     "no labels": (_remove("label_02/0007.txt"), r"label_02/0007\.txt: no such file"),

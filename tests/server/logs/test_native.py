@@ -114,7 +114,7 @@ BAD_MANIFESTS: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     "long quaternion": (lambda c: c["ego"]["quaternions"].__setitem__(0, [2, 0, 0, 0]), "unit"),
     "ragged positions": (lambda c: c["ego"]["positions"][0].pop(), "'positions' must be"),
     "no cameras": (lambda c: c.update(cameras=[]), "at least one camera"),
-    "no rotation": (
+    "not a rotation": (
         lambda c: c["cameras"][0]["T_vehicle_camera"][0].__setitem__(2, 3.0), "rigid transform"
     ),
     "camera name with a slash": (lambda c: c["cameras"][0].update(name="a/b"), "folder name"),

@@ -163,7 +163,7 @@ MISTAKES: dict[str, tuple[Callable[[Manifest], None], str]] = {
     "inverted extrinsics": (extrinsics_inverted, "camera 'front' .* T_vehicle_camera inverted"),
     "cameras' axes": (axes_of_the_vehicle, "camera 'front' .* must be x right, y down, z forward"),
     "K of another size": (intrinsics_of_twice_the_size, "is K of another size"),
-    "UTM": (utm, r"5,411 km from the world's zero, .* 5e\+02 mm: subtract"),
+    "UTM": (utm, r"5,411 km from the world's origin, .* 5e\+02 mm: subtract"),
     "boxes in UTM": (boxes_left_behind_in_utm, "the nearest box is .* in the world's frame"),
     "boxes of the vehicle": (
         boxes_in_the_vehicle_frame,
@@ -199,11 +199,11 @@ def test_intensities_of_a_byte_are_asked_about(own: Path) -> None:
 
     change_sweeps(own, scaled)
     questions = inspect_log(open_log(own)).questions
-    assert any("LiDAR intensity goes up to" in p for p in questions), questions
+    assert any("LiDAR intensity is up to" in p for p in questions), questions
 
 
 def test_training_far_from_zero_is_refused(own: Path) -> None:
-    with pytest.raises(LogError, match=r"5,411 km from the world's zero.* only move by 0\.5 m"):
+    with pytest.raises(LogError, match=r"5,411 km from the world's origin.* only move in steps of 0\.5 m"):
         check_log(open_log(change(own, utm))).raise_for_problems()
 
 

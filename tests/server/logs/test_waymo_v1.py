@@ -203,7 +203,7 @@ def test_cut_file_is_named(folder: Path) -> None:
 
 def test_other_file_is_named(folder: Path) -> None:
     (folder / "tiny.tfrecord").write_bytes(b"nothing of the kind, but long enough")
-    with pytest.raises(LogError, match=r"tiny\.tfrecord at byte 0: .*no TFRecord"):
+    with pytest.raises(LogError, match=r"tiny\.tfrecord at byte 0: .*not a TFRecord"):
         open_log(folder)
 
 

@@ -151,7 +151,7 @@ def test_signals_rule_the_lanes_that_they_face_and_find_their_stop_line(tmp_path
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        ("<OpenDRIVE", "no XML"),
+        ("<OpenDRIVE", "not an XML"),
         ("<map/>", "expected <OpenDRIVE>"),
         (f"<OpenDRIVE>{HEADER}</OpenDRIVE>", "no <road>"),
         ('<OpenDRIVE><header revMajor="2" revMinor="0"/></OpenDRIVE>', "2.0"),

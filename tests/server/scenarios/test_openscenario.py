@@ -50,7 +50,7 @@ def test_an_attribute_that_is_not_supported_is_refused_by_name_and_line():
         ('<?xml version="1.0" encoding="utf-0"?><OpenSCENARIO/>', "is not an XML file.*utf-0"),
         ("<OpenDRIVE/>", "expected <OpenSCENARIO>"),
         ('<!DOCTYPE x [<!ENTITY a "b">]><OpenSCENARIO/>', "document type"),
-        ("<a>" * 300, "nested deeper|no XML"),
+        ("<a>" * 300, "nested deeper|not an XML"),
         (CASE.replace('revMajor="1"', 'revMajor="2"'), "version 2"),
         (CASE.replace('revMajor="1"', 'revMajor="NaN"'), "'NaN'; it must be a whole number"),
         (CASE.replace('revMajor="1"', 'revMajor="INF"'), "'INF'; it must be a whole number"),

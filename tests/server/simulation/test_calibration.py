@@ -173,7 +173,7 @@ def test_what_cannot_be_fitted_is_named(scene, state, truth, parameters, message
         ({"boxes": [{"t_us": -5, "position": [0, 0, 0]}]}, "the simulation begins at 0 us"),
         ({"boxes": [{"t_us": 10**9, "position": [0, 0, 0]}]}, "over 30 s at most"),
         ({"images": [{"t_us": 1, "camera": "rear", "image": ""}]}, "the scene has front, left"),
-        ({"images": [{"t_us": 1, "camera": "front", "image": "??"}]}, "no base64"),
+        ({"images": [{"t_us": 1, "camera": "front", "image": "??"}]}, "not base64"),
         ({"images": [{"t_us": 1, "camera": "front", "image": "AAAA"}]}, "neither PNG nor JPEG"),
         ({"points": [{"place": [0, 0, 0], "seen": []}]}, "at least 1 item"),
         ({}, "nothing was observed"),

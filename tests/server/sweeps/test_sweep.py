@@ -133,7 +133,7 @@ def test_of_a_journal_that_is_cut_and_damaged_only_rows_that_were_written_are_le
 def test_another_file_is_no_journal(tmp_path):
     path = tmp_path / "journal"
     path.write_text("something else\n")
-    with pytest.raises(ValueError, match="no journal"):
+    with pytest.raises(ValueError, match="not a journal"):
         Journal(path)
 
 

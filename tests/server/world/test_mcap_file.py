@@ -152,5 +152,5 @@ def test_episodes_without_plans_have_no_topic_for_them(make_scene):
 def test_files_without_an_episode_are_refused(tmp_path):
     path = tmp_path / "other.mcap"
     path.write_bytes(b"not mcap at all, but long enough to be looked at")
-    with pytest.raises(RecordingError, match="no MCAP file"):
+    with pytest.raises(RecordingError, match="not an MCAP file"):
         recording_in(path)

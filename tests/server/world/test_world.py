@@ -164,7 +164,7 @@ def test_no_step_after_the_end(make_world):
         (
             {"sensors": [{"camera": "front", "period_us": 150_000}]},
             ErrorCode.INVALID_REQUEST,
-            "no multiple of dt_us 100000",
+            "not a multiple of dt_us 100000",
         ),
         (
             {"sensors": [{"camera": "front"}, {"camera": "front"}]},

@@ -289,7 +289,7 @@ def test_poses_of_another_length_are_refused() -> None:
 
 
 def test_poses_that_are_no_transforms_are_refused() -> None:
-    with pytest.raises(RenderError, match="no rigid transforms"):
+    with pytest.raises(RenderError, match="not rigid transforms"):
         cast([], spinning(), np.full((4, 4), np.nan))
 
 

@@ -53,7 +53,7 @@ def test_what_is_not_there_is_told(objects):
 
 
 def test_only_digests_are_names(objects, file):
-    with pytest.raises(ValueError, match="no SHA-256"):
+    with pytest.raises(ValueError, match="not an SHA-256"):
         objects.put(file, "../../etc/passwd")
 
 

@@ -126,7 +126,7 @@ TABLE = {"kind": "table", "azimuth_deg": [0.0], "elevation_deg": [0.0], "time_us
         ({"lidar": "none"}, "no LiDAR 'none' in the catalogue; it has"),
         ({"lidar": "top", "model": FAN | {"beams": ROWS}}, "allowed are 1 to 524,288 rays"),
         ({"lidar": "top", "model": FAN | {"returns": 9}}, "returns must be 1, 2 or 3"),
-        ({"lidar": "top", "model": FAN, "period_us": 70_000}, "no multiple of dt_us"),
+        ({"lidar": "top", "model": FAN, "period_us": 70_000}, "not a multiple of dt_us"),
         ({"lidar": "top", "model": FAN, "period_us": 50_000}, "a sweep takes"),
         ({"lidar": "corner", "model": FAN}, "one name"),
     ],

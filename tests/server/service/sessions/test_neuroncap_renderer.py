@@ -171,7 +171,7 @@ def test_raw_images_are_saved_tensors_in_base64(serve, site, tiny_scene):
     ("path", "body", "status", "said"),
     [
         ("/render_image", {}, 422, "pose"),
-        ("/render_image", {"pose": [[1.0] * 4] * 4}, 422, "no rigid transform"),
+        ("/render_image", {"pose": [[1.0] * 4] * 4}, 422, "not a rigid transform"),
         ("/render_image", {"image_format": "webp"}, 422, "image_format"),
         (
             "/render_image",
