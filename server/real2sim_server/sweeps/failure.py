@@ -274,8 +274,8 @@ def _summary(report: Mapping[str, Any]) -> str:
     spaces = ", ".join(escape(s["name"]) for s in report["spaces"])
     if not found:
         return (
-            f'<p class="big">No avoidable failure in {episodes} episodes of {spaces}. That is no '
-            "proof that there is none.</p>"
+            f'<p class="big">No avoidable failure in {episodes} episodes of {spaces}. That does '
+            "not prove that there is none.</p>"
         )
     return (
         f'<p class="big">{report["avoidable"]} avoidable collisions of {report["at_fault"]} that '

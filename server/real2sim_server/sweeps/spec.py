@@ -469,7 +469,7 @@ def _loaded(path: Path, kind: type[S], what: str, scenes: Path | None) -> S:
     try:
         fields = _content(path)
     except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
-        raise CommandError(f"{path} is no {what}: {error}") from error
+        raise CommandError(f"{path} is not a valid {what}: {error}") from error
     return _validated(fields, path.parent, kind, (str(path), what), scenes)
 
 
@@ -487,9 +487,9 @@ def _validated(
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
-        raise CommandError(f"{name} is no {what}: {where}: {first['msg']}") from error
+        raise CommandError(f"{name} is not a valid {what}: {where}: {first['msg']}") from error
     except (TypeError, ValueError) as error:
-        raise CommandError(f"{name} is no {what}: {error}") from error
+        raise CommandError(f"{name} is not a valid {what}: {error}") from error
 
 
 def _content(path: Path) -> dict[str, Any]:

@@ -186,7 +186,7 @@ def test_cameras_get_the_names_that_the_planner_knows(peer, planner):
         ({"trajectory": []}, "shape"),
         ({}, "shape"),
         ([1, 2], "shape"),
-        ({"trajectory": [["a", "b"]]}, "no list of points"),
+        ({"trajectory": [["a", "b"]]}, "not a list of points"),
     ],
 )
 def test_answers_that_are_no_way_are_refused(peer, planner, reply, said):

@@ -249,7 +249,7 @@ BAD_FOLDERS: dict[str, tuple[str, Callable[[Path], None], str]] = {
         r"sample_annotation\.json: 'a0_.*': the box of .* needs a positive",
     ),
     "table no JSON": (
-        "nuscenes", _cut("v1.0-mini/instance.json", 20), r"instance\.json: is not JSON"
+        "nuscenes", _cut("v1.0-mini/instance.json", 20), r"instance\.json: is not a JSON"
     ),
     "front image missing": (
         "nuscenes",

@@ -193,8 +193,8 @@ BAD_LAYOUTS: dict[str, tuple[Callable[[Path], None], str]] = {
     "pose not finite": (
         _edit_row("poses/0007.txt", 1, lambda w: w.__setitem__(3, "nan")), "line 2: .*not finite"
     ),
-    "pose not a rotation": (
-        _edit_row("poses/0007.txt", 2, lambda w: w.__setitem__(0, "2.0")), "line 3: .*not a rotation"
+    "pose, not a rotation": (
+        _edit_row("poses/0007.txt", 2, lambda w: w.__setitem__(0, "2.0")), "3: .*not a rotation"
     ),
     "pose missing": (_edit_row("poses/0007.txt", 2, lambda w: w.clear()), "holds 2 poses"),
     "no labels": (_remove("label_02/0007.txt"), r"label_02/0007\.txt: no such file"),

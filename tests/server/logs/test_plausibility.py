@@ -203,7 +203,9 @@ def test_intensities_of_a_byte_are_asked_about(own: Path) -> None:
 
 
 def test_training_far_from_zero_is_refused(own: Path) -> None:
-    with pytest.raises(LogError, match=r"5,411 km from the world's origin.* only move in steps of 0\.5 m"):
+    with pytest.raises(
+        LogError, match=r"5,411 km from the world's origin.* only move in steps of 0\.5 m"
+    ):
         check_log(open_log(change(own, utm))).raise_for_problems()
 
 

@@ -47,7 +47,7 @@ def test_times_are_varied_in_clock_steps():
         ({"scene": "s", "scenario": "t"}, "exactly one"),
         ({"scene": "s", "reset": {"seed": 3}}, "seed"),
         ({"scene": "s", "reset": {"dt": 3}}, "dt"),
-        ({"scene": "s", "jitter": {"agents.drivers.car.gap": 1.0}}, "no number"),
+        ({"scene": "s", "jitter": {"agents.drivers.car.gap": 1.0}}, "not a number"),
         ({"scene": "s", "operations": [{"op": "fly"}]}, "fly"),
     ],
 )

@@ -216,12 +216,12 @@ def test_files_may_leave_plain_kinds_out(tmp_path):
     ("text", "message"),
     [
         ("[1, 2]", "no mapping"),
-        ("case: [", "is not a sweep"),
+        ("case: [", "is not a valid sweep"),
         ("a: &x [1]\nb: *x", "aliases"),
         ("case: {name: c, scene: tiny}\nparameters: {}", "parameters"),
         ("case: {name: c, scene: tiny}\nparameters: gap", "parameters"),
         ("case: {name: c, scenario: s}\nparameters: {x: {low: 0, high: 1}}", "names a scene"),
-        ("!!python/object/apply:os.system ['true']", "is not a sweep"),
+        ("!!python/object/apply:os.system ['true']", "is not a valid sweep"),
     ],
 )
 def test_files_that_are_no_sweep_are_refused_with_a_reason(tmp_path, text, message):

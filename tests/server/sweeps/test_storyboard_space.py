@@ -88,7 +88,7 @@ def test_distributions_of_a_file_are_parameters_of_its_space(folder, scene_folde
         ("storyboard: brakes.xosc\ncase: {scene: tiny}\n", "has no distributions"),
         (SPACE + "  gab: {low: 1, high: 2}\n", "no parameter 'gab'.* it has gap, speed"),
         (SPACE.replace("brakes.xosc", "none.xosc"), "none.xosc"),
-        (SPACE.replace("low: 7.0, high: 8.0", "values: [steep]"), "no number"),
+        (SPACE.replace("low: 7.0, high: 8.0", "values: [steep]"), "not a number"),
         (SPACE.replace("brakes.xosc", "{file: brakes.xosc, eggo: x}"), "eggo"),
     ],
 )

@@ -149,7 +149,7 @@ def test_a_stop_rule_ends_at_the_same_row_whatever_was_driven(alone, scene_folde
     ("change", "message"),
     [
         ({"metrics": ["beauty"]}, "no score 'beauty'"),
-        ({"rank_by": "beauty"}, "no column"),
+        ({"rank_by": "beauty"}, "not a column"),
         ({"planners": ["depth_sampling"]}, "sweeps only render rgb"),
         ({"planners": ["nobody"]}, "is unknown"),
         ({"case": SWEEP["case"] | {"scene": "nowhere"}}, "no scene 'nowhere'"),
