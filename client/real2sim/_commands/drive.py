@@ -90,7 +90,7 @@ def drive(
         str | None,
         typer.Option(
             metavar="JSON",
-            help='What --seed draws: randomization of reset, for example \'{"start": '
+            help='Randomization of reset, drawn with --seed, for example \'{"start": '
             '{"lateral": 0.5}}\'.',
         ),
     ] = None,

@@ -86,9 +86,9 @@ function choice() {
       textContent: "Drive the recording vehicle through the current scenario.",
     }),
     ...cornerCases(draw),
-    row("who", [pick("who", WHO)]),
+    row("driver", [pick("who", WHO)]),
     row("pace", [pick("pace", PACES)]),
-    row("a crash", [
+    row("after a crash", [
       pick("onCollision", [
         ["terminate", "stop the drive"],
         ["continue", "continue"],
