@@ -42,7 +42,7 @@ export function cornerCases(draw) {
   });
   const now = written ? `Now: ${written.name || "a storyboard of your own"}.` : "";
   return [
-    row("description", [select]),
+    row("corner case", [select]),
     ...(chosen ? choice() : []),
     ...(now ? [el("small", { id: "corner-case-now", textContent: now }), nothing()] : []),
   ];
