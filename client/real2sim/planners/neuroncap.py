@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from ..observation import Observation
 
 SPACING_US = 500_000
-"""Between the points of an answer."""
+"""Time between the points of an answer."""
 COMMANDS = {"right": 0, "left": 1, "straight": 2}
 NUSCENES_CAMERAS = {
     "CAM_FRONT": 0.0,
@@ -52,7 +52,7 @@ NUSCENES_LIDAR = (
     (0.0, 0.0, 1.0, 1.84),
     (0.0, 0.0, 0.0, 1.0),
 )
-"""T_ego_lidar of nuScenes to a centimetre: x to the right, y forward. Networks count in it."""
+"""T_ego_lidar of nuScenes, rounded to a centimetre: x right, y forward. Planners use this frame."""
 
 
 class NeuroNcap:

@@ -289,7 +289,7 @@ def _lidar_figures(score: LidarScore) -> dict[str, object]:
 # --- fit-lidar, fit-uncertainty -------------------------------------------------------------------
 
 Fitted = tuple["Scene", dict[str, Any]]
-"""The fitted scene, and figures of the fit."""
+"""The fitted scene, and the fit's figures."""
 
 
 @dataclass(frozen=True)

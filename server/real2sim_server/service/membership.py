@@ -95,7 +95,7 @@ class Sharing:
         """Fetch an item that another worker has shared; returns whether it exists.
 
         Raises:
-            ServiceError: STORAGE_UNAVAILABLE: the object store fails.
+            ServiceError: STORAGE_UNAVAILABLE if the object store fails.
         """
         row = await self._log.get(kind, name)
         if row is None or row.deleted:
@@ -161,7 +161,7 @@ class Sharing:
                 await self.look()
                 self._in_trouble = False
             except StoreError:
-                pass  # it tells of its trouble itself
+                pass  # the store logs its own errors
             except (ObjectStoreError, OSError) as error:
                 if not self._in_trouble:
                     log.error("store of objects in trouble", reason=str(error))
@@ -189,8 +189,8 @@ class Sharing:
             log.info("bundle shared", kind=kind, name=name, bytes=bundle.bytes)
 
     async def _follow_assets(self) -> None:
-        """Download all assets of the fleet, so that edits need not wait for them, and delete those
-        that were deleted elsewhere."""
+        """Download all assets of the fleet ahead of edits, and delete assets that were deleted
+        elsewhere."""
         rows = [row for (kind, _), row in self._known.items() if kind == "asset"]
         for row in rows:
             if not row.deleted:
@@ -241,7 +241,7 @@ def _unavailable(what: str, error: ObjectStoreError) -> ServiceError:
 
 
 RENEWALS = 4
-"""Renewals per lease duration, so that some may be late."""
+"""Renewals per lease duration; some of them may be late."""
 
 
 class Membership:
@@ -296,7 +296,7 @@ class Membership:
             await self._renew()
 
     async def leave(self) -> None:
-        """Give up the lease: other workers may take the sessions immediately."""
+        """Give up the lease; other workers may take over the sessions immediately."""
         self._left = True
         with contextlib.suppress(StoreError):
             await self._leases.give_up(self._document())
@@ -307,7 +307,7 @@ class Membership:
             try:
                 await self._renew()
             except StoreError:
-                # The store logs its own failures; without it others cannot take over either.
+                # The store logs its own failures. While it fails, others cannot take over either.
                 continue
             except Exception:
                 # Any error: without its lease the worker would lose its sessions.
