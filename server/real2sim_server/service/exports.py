@@ -101,7 +101,7 @@ async def export_video(
 async def _render_frame(
     renderer: Renderer, render_request: RenderRequest, context: JobContext
 ) -> EncodedFrame:
-    """Render the frame with low priority, after interactive requests."""
+    """Render the frame; while the engine's queue is full, wait and retry."""
     while True:
         try:
             return (await renderer.render(render_request, stream="export")).frames[0]
@@ -230,11 +230,11 @@ class EngineBackend:
 
     @property
     def draws_lenses(self) -> bool:
-        """The same as of the engine's backend."""
+        """Whether the engine's backend renders lenses."""
         return getattr(self.backend, "draws_lenses", False)
 
     def rasterize(self, request: RasterRequest) -> RenderOutput:
-        """Render with low priority, after interactive requests. Raises JobCancelled."""
+        """Render with low priority; waits while the queue is full. Raises JobCancelled."""
         yielding = replace(request, between=self.engine.yield_to_urgent)
         return self.on_engine(self.backend.rasterize, yielding)
 

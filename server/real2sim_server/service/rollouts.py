@@ -75,7 +75,7 @@ class RolloutPlan:
     """A rollout, ready to start.
 
     Attributes:
-        scene: the scene with erased regions hidden and inserted assets added.
+        scene: scene without erased regions and with inserted assets.
         state: state of the scenario; ``resolved_objects`` are its objects as in ``scene``.
         options: options of the physics.
     """
@@ -377,7 +377,7 @@ def _physics(subject: ObjectState, start: int) -> ObjectPhysics:
 
 
 def colliders_of(state: ScenarioState) -> list[Collider]:
-    """Rigid colliders: the scenario's, and the scene's ground unless one of them is a ground."""
+    """The scenario's rigid colliders, and the scene's ground if the scenario has no ground."""
     colliders: list[Collider] = []
     grounds = [c for c in state.standing_colliders if isinstance(c.shape, GroundShape)]
     if not grounds:
@@ -400,7 +400,7 @@ def _collider(state: ScenarioState, given: AddCollider) -> Collider:
 def _solid(
     shape: BoxShape | CylinderShape | CapsuleShape | MeshShape,
 ) -> tuple[type[Solid], dict[str, Any]]:
-    """The solid of a shape, with its members."""
+    """The solid of a shape, with the shape's parameters."""
     match shape:
         case BoxShape():
             return Box, {"size": shape.size}
@@ -448,7 +448,7 @@ class Simulations:
 
         Raises:
             ServiceError: as for scenarios, scene cache and jobs; INVALID_REQUEST, UNKNOWN_OBJECT or
-                TIME_OUT_OF_RANGE if it cannot be simulated.
+                TIME_OUT_OF_RANGE if the request cannot be simulated.
         """
         revision = (await self._scenarios.view(scenario_id)).revision
         work = await self._work(scenario_id, revision, request)
@@ -501,7 +501,7 @@ class Simulations:
         scene, playback = cached
 
         def instances(t_us: int, *, aboard: bool = True) -> Sequence[Instance]:
-            # It caches the last deformed clouds, which is not thread-safe.
+            # The replay caches the last deformed clouds and is not thread-safe.
             with self._drawing:
                 return playback.instances(t_us, aboard=aboard)
 
@@ -601,7 +601,7 @@ def _run(
     progress: Callable[[float], None],
     cancelled: Callable[[], bool],
 ) -> ObjectCalibration:
-    # Gradients at the start, once in between, and at the end; steps; and coarser cells.
+    # Gradients at the start, in the middle and at the end; search steps; coarser cells.
     expected = 6 * len(request.parameters) + 2 * request.steps + 5
     try:
         return calibrate_object(

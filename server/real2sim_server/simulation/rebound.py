@@ -38,7 +38,7 @@ from .rigid import RigidMotion, clearance
 QUIET = 2
 """Steps without an impulse after which an impact is over."""
 NOTHING = 1e-3
-"""Fraction of the previous impulse below which there is none."""
+"""Impulses below this fraction of the previous one count as zero."""
 EXACT = 0.01
 """Tolerance of the separation speed, as a fraction of the approach; no correction within it."""
 MIN_APPROACH = 0.3
@@ -169,7 +169,7 @@ class Bounces:
         self._totals: dict[tuple[str, str], tuple[Float, Float]] = {}
 
     def figures(self, body: str) -> list[dict[str, Any]]:
-        """Bounces of a body as JSON values."""
+        """Impacts of a body as JSON values."""
         members = (asdict(b) for b in self.log if b.body == body)
         return [{k: _rounded(v) for k, v in m.items() if k != "body"} for m in members]
 
@@ -366,7 +366,7 @@ def _kinetic(motions: Mapping[str, RigidMotion]) -> float:
 def _corrections(
     meetings: Sequence[_Meeting], now: Mapping[str, RigidMotion], give: Float
 ) -> Iterator[Correction]:
-    """Impulses that change the separation speeds by ``give`` [m/s]."""
+    """Impulses that change the separation speeds by ``give`` [m/s] in total."""
     response = np.zeros((len(meetings), len(meetings)))
     for k, m in enumerate(meetings):
         pushed = dict(now)
@@ -524,7 +524,7 @@ def _is_far(solid: Solid, centre: Float, reach: float) -> bool:
 
 
 def _still(body: DeformableBody) -> Any:
-    """The body for the solver, at its place; the test impact sets the velocities."""
+    """The body for the solver, at the contact; the test impact sets the velocities."""
     return replace(body.solver_body(), particle_velocities=None, particle_gradients=None)
 
 

@@ -1,4 +1,4 @@
-"""Results of a simulation: poses, shapes, contacts, energies, and its frames for the renderer."""
+"""Results of a simulation (poses, shapes, contacts, energies), and frames for the renderer."""
 
 from __future__ import annotations
 
@@ -105,8 +105,8 @@ class Rebound:
         requested: requested coefficient of restitution.
         achieved: restitution in test impacts; for the simulated impacts see Bounce.
         elastic: restitution without added viscosity, the maximum.
-        other: name of the collider used for the fit; None if the body hits nothing, so that a wall
-            across its path was used.
+        other: name of the collider used for the fit; None for a wall across the body's path, used
+            if the body hits nothing.
         speed: speed of the test impacts [m/s].
         viscosity: added viscosity [Pa s].
     """
@@ -119,7 +119,7 @@ class Rebound:
     viscosity: float
 
     def figures(self) -> dict[str, Any]:
-        """As JSON values."""
+        """The rebound as JSON values."""
         return {k: round(v, 6) if isinstance(v, float) else v for k, v in asdict(self).items()}
 
 
@@ -139,7 +139,7 @@ class SimulationResult:
             Rebound and its ``bounces`` for each object with a requested restitution; and with
             ``background`` the boxes of the background (JSON values only).
         breakages: broken vehicle parts; None if they were not computed (``paper`` preset and
-            results of older versions), in which case bodies are drawn smooth.
+            results of older versions). Bodies are then drawn smooth.
     """
 
     objects: Mapping[str, ObjectResult]
