@@ -418,8 +418,7 @@ def _tensor(values: NDArray[np.float64]) -> torch.Tensor:
 # vehicle.
 
 SHADOW, SILLS = 0.1, 0.3
-"""Height of the sills, and height to which Gaussians of shadow or tyres below the sills reach down;
-both above the road [m]."""
+"""Gaussians below SILLS [m] that reach down to SHADOW [m] above the road are shadow or tyre."""
 FLOOR = 0.2
 """Height of the floor above the road [m]."""
 INSET = (0.16, 0.06)

@@ -169,7 +169,7 @@ class Bounces:
         self._totals: dict[tuple[str, str], tuple[Float, Float]] = {}
 
     def figures(self, body: str) -> list[dict[str, Any]]:
-        """Impacts of a body as JSON values."""
+        """Bounces of a body as JSON values."""
         members = (asdict(b) for b in self.log if b.body == body)
         return [{k: _rounded(v) for k, v in m.items() if k != "body"} for m in members]
 
@@ -366,7 +366,7 @@ def _kinetic(motions: Mapping[str, RigidMotion]) -> float:
 def _corrections(
     meetings: Sequence[_Meeting], now: Mapping[str, RigidMotion], give: Float
 ) -> Iterator[Correction]:
-    """Impulses that change the separation speeds by ``give`` [m/s] in total."""
+    """Impulses that change the separation speeds by ``give`` [m/s]."""
     response = np.zeros((len(meetings), len(meetings)))
     for k, m in enumerate(meetings):
         pushed = dict(now)

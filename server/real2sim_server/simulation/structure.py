@@ -249,7 +249,7 @@ class ClassMass:
         per_volume: mass per volume of the object's box [kg/m^3].
         source: source of the value.
         person: whether it includes a person as high as the box.
-        besides: additional mass without the person [kg].
+        besides: mass in addition to the person, such as a bicycle [kg].
         stability: static stability factor, half the track over the height of the centre of mass;
             None to use the centre of mass of the filled shape.
         stability_source: source of that factor.

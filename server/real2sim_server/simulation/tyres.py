@@ -332,19 +332,19 @@ class Tyres:
     def standing(self, T_world_object: Float, road: Sequence[Collider]) -> Tyres:
         """Tyres whose rest heights match the current pose, for wheels close to the road.
 
-        Tracked boxes miss the road by a few centimetres, which must not cause a jump. Vehicles that
-        are higher up fall.
+        Tracked boxes miss the road by a few centimetres, which must not cause a jump. Vehicles
+        higher above the road fall.
         """
         heights, _ = nearest(road, self._points(T_world_object))
         near = (heights < ABOVE_MAX) & (heights > -LIFT_MAX)
         return replace(self, rest=np.where(near.all(), heights, np.zeros(4)))
 
     def braked(self, fraction: float) -> Tyres:
-        """The tyres with ``fraction`` of their grip braked, in [0, 1]."""
+        """The tyres with a ``fraction`` of their grip braked, in [0, 1]."""
         return replace(self, brake=fraction)
 
     def lifts(self, T_world_object: Float, road: Sequence[Collider]) -> Float:
-        """[4] spring compression that puts the wheels on the road instead of inside it [m]."""
+        """[4] spring compression that keeps the wheels from sinking into the road [m]."""
         heights, normals = nearest(road, self._points(T_world_object))
         carrying = np.isfinite(heights) & (normals @ T_world_object[:3, 2] > UPRIGHT)
         squeeze = np.where(carrying, self.rest - heights, 0.0)

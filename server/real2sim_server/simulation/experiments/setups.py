@@ -328,7 +328,7 @@ def _best(request: Request) -> PlacedObject:
 
 
 def _candidates(request: Request) -> list[PlacedObject]:
-    """The named vehicles, else all cars at the start, whatever their pose."""
+    """The named vehicles, else all cars at the start; experiments replace their poses."""
     if request.named:
         return list(request.chosen)
     there = [
