@@ -230,12 +230,12 @@ def session_and_token(session: Any) -> tuple[str | None, str | None]:
 
 
 def optional_scene_name(scene: SceneRef | None) -> str | None:
-    """As :func:`scene_name`; None stays None."""
+    """Like :func:`scene_name`; returns None for None."""
     return None if scene is None else scene_name(scene)
 
 
 def optional_scenario_id(scenario: ScenarioRef | None) -> str | None:
-    """As :func:`scenario_id_of`; None stays None."""
+    """Like :func:`scenario_id_of`; returns None for None."""
     return None if scenario is None else scenario_id_of(scenario)
 
 

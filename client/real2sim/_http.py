@@ -216,7 +216,7 @@ class Attempts:
         self._made = 0
 
     def delay_after(self, error: Real2SimError) -> float | None:
-        """Seconds until the next attempt; None if there is none."""
+        """Seconds until the next attempt; None to give up."""
         attempt, self._made = self._made, self._made + 1
         # After a long wait, a retry would only add load to a slow worker.
         waited = self._request.long_timeout and isinstance(error, ReplyTimeoutError)

@@ -224,8 +224,8 @@ class ObjectEdits(Handle, Generic[R]):
         """Rotate the object [rad]; times as in :meth:`translate`.
 
         Args:
-            angle: [rad].
-            axis: of any length.
+            angle: angle [rad].
+            axis: rotation axis, of any length.
             frame: frame of the axis, ``world`` or ``object``.
             start_us, end_us, blend_us: as in :meth:`translate`.
             about_us: rotates the path too, about the object's position at this time [us]. By

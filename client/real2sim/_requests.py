@@ -113,7 +113,7 @@ RadarSensor: TypeAlias = str | RadarSpec | Mapping[str, Any]
 
 
 class ResetOptions(TypedDict, total=False):
-    """Options of reset, besides its sensors; meaning and defaults as in ``ResetSpec``."""
+    """Options of reset except its sensors; meaning and defaults as in ``ResetSpec``."""
 
     lidars: Sequence[LidarSensor]
     radars: Sequence[RadarSensor]

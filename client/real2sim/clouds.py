@@ -107,7 +107,7 @@ class PointCloud(Handle):
         return self.count
 
     def in_world(self) -> NDArray[np.float64]:
-        """Points [N, 3] float64 in the world, as of a compensated cloud [m].
+        """Points [N, 3] float64 in the world frame, with motion compensation [m].
 
         Examples:
             >>> cloud.in_world().shape == (cloud.count, 3)

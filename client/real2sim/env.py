@@ -47,7 +47,7 @@ AGENT_FIELDS = 9
 POINTS = 8192
 """Default number of LiDAR rows in observations."""
 DETECTIONS = 256
-"""Rows of a radar."""
+"""Number of radar rows in observations."""
 CLOUD_FIELDS = {"lidar": ("intensity",), "radar": ("velocity", "rcs")}
 """Columns after x, y, z."""
 
@@ -249,7 +249,7 @@ class DriveEnv(gymnasium.Env[Obs, NDArray[np.float32]]):
             self._images[name] = np.minimum(image, most).astype(dtype)
         for name, cloud in obs.clouds.items():
             self._clouds[name] = _rows_of(cloud, self._rows[cloud.modality])
-        # Copies, so that changing an observation in place does not change the next one.
+        # Copies: changing an observation in place must not change the next one.
         kept = {**self._images, **self._clouds}
         return seen | {name: array.copy() for name, array in kept.items()}
 

@@ -108,7 +108,7 @@ class View(Handle):
         )
 
     def lidar(self, name: str | None = None) -> LidarCloud:
-        """The sweep of a LiDAR; default: of the only one.
+        """The sweep of a LiDAR; default: the only LiDAR.
 
         Raises:
             KeyError: no such LiDAR; the message names the available ones.

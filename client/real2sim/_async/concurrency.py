@@ -25,7 +25,7 @@ class Lookup(Handle):
 
 
 async def sleep(seconds: float) -> None:
-    """Wait."""
+    """Wait for a number of seconds."""
     await asyncio.sleep(seconds)
 
 

@@ -332,8 +332,9 @@ class AsyncSweeps:
 
         Args:
             scene: its name.
-            parameters: by name, as in ``real2sim sweep``: ``{"low": 2, "high": 20}`` and others,
-                with a ``path`` into ``reset``, or without one if the scenario has the parameter.
+            parameters: parameters by name, as in ``real2sim sweep``, such as
+                ``{"low": 2, "high": 20}``; with a ``path`` into ``reset``, or without one if the
+                scenario has the parameter.
             corner_case, openscenario, storyboard: the traffic; set at most one of them. A case of
                 the gallery, the text or path of an OpenSCENARIO file, or a storyboard in the
                 scene's frame.

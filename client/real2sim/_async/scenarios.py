@@ -332,7 +332,7 @@ class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
                 physics. ``ego`` is the recording vehicle.
             preset: how objects become bodies: ``vehicle`` (default) or ``paper`` (default of the
                 paper's experiments).
-            physics: by object, or ``"*"`` for all: values as in ``set_physics``, for this rollout.
+            physics: values as in ``set_physics``, by object or ``"*"`` for all; for this rollout.
             gravity: [m/s^2]; default: 9.81 downwards.
             max_particles: maximum for all bodies together.
             experiment: ``wall``, ``pair``, ``drop`` of the paper, ``frontal``, ``t_bone``, ``pole``
@@ -448,7 +448,7 @@ class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
         """Write the centres of the Gaussians as a ply with colour, normal, class and instance.
 
         Args:
-            path: of the ply file.
+            path: path of the ply file.
             t, t_us: time in seconds or in microseconds; default: the start.
             part: ``all``, ``background`` or ``objects``.
 

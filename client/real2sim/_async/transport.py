@@ -96,7 +96,7 @@ async def outlast(
         passes: whether an error is temporary.
 
     Raises:
-        Real2SimError: from the last try, or not temporary.
+        Real2SimError: from the last attempt, or not temporary.
     """
     until = time.monotonic() + seconds
     for attempt in range(MAX_RECONNECTS):
@@ -122,7 +122,7 @@ async def reconnect(
         seconds: period in which retries start.
 
     Raises:
-        UnreachableError, CapacityError, ReplyTimeoutError: from the last try.
+        UnreachableError, CapacityError, ReplyTimeoutError: from the last attempt.
         Real2SimError: the worker refuses.
     """
     until = time.monotonic() + seconds

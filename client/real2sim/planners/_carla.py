@@ -34,22 +34,22 @@ class Vector3D:
     z: float = 0.0
 
     def length(self) -> float:
-        """Euclidean."""
+        """Euclidean length."""
         return math.sqrt(self.x**2 + self.y**2 + self.z**2)
 
 
 @dataclass
 class Location(Vector3D):
-    """[m]"""
+    """A position [m]."""
 
     def distance(self, other: Vector3D) -> float:
-        """To another location [m]."""
+        """Distance to another location [m]."""
         return math.dist((self.x, self.y, self.z), (other.x, other.y, other.z))
 
 
 @dataclass
 class Rotation:
-    """Degrees: pitch nose up, yaw to the right, roll with the right side down."""
+    """A rotation in degrees: pitch nose up, yaw to the right, roll with the right side down."""
 
     pitch: float = 0.0
     yaw: float = 0.0

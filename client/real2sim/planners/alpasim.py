@@ -1,8 +1,7 @@
 """Planners made for AlpaSim (NVIDIA 2025), unchanged: gRPC, ``EgodriverService``.
 
-AlpaSim's local frame is our world frame, shifted so that an episode begins at its origin, because
-its numbers are single precision. Its rig frame is the vehicle frame. Requires the ``alpasim``
-extra.
+AlpaSim's local frame is our world frame, shifted to the start of the episode, because AlpaSim uses
+single precision. Its rig frame is the vehicle frame. Requires the ``alpasim`` extra.
 """
 
 from __future__ import annotations

@@ -47,7 +47,7 @@ MIN_SEEN, MAX_UNSEEN = 0.2, 0.1
 """Fractions of an agent's image: minimum seen, and maximum unseen without a warning."""
 
 EARTH_RADIUS = 6_378_137.0
-"""[m]"""
+"""Radius of CARLA's spherical earth [m]."""
 
 GRAVITY = 9.81
 
@@ -113,7 +113,7 @@ class CarlaAgent:
                 (default: 42, 2 degrees, as in CARLA's leaderboard).
 
         Raises:
-            PeerError: there is no such agent, or it requires something unavailable.
+            PeerError: the agent does not exist or requires something unavailable.
             ValueError: an unknown option.
         """
         where, options = _split(target)

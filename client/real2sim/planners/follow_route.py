@@ -169,7 +169,7 @@ class Path:
     def poses(self, travelled: Array, recovery: float) -> Array:
         """[K, 3] x [m], y [m], yaw [rad] after the distances ``travelled`` [K]; the offset decays.
 
-        Yaw is the direction of the resulting path, so that a car can follow it.
+        Yaw is the direction of the resulting path, which a car can follow.
         """
         reach = 0.25
         both = self._at(np.concatenate([travelled, travelled + reach]), recovery)
@@ -372,6 +372,6 @@ def _lengths(vectors: Array) -> Array:
 
 
 def _unwrapped(angles: Array) -> Array:
-    """Angles [N] without jumps of a full turn [rad]; unchanged if there are none."""
+    """Angles [N] without jumps of a full turn [rad]."""
     steps = np.abs(angles[1:] - angles[:-1])
     return np.unwrap(angles) if len(steps) and steps.max() > math.pi else angles

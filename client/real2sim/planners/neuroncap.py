@@ -58,8 +58,7 @@ NUSCENES_LIDAR = (
 class NeuroNcap:
     """A planner behind NeuroNCAP's interface.
 
-    Cameras with one of nuScenes' names keep it; others get the name with the most similar
-    direction.
+    Cameras with a nuScenes name keep it; others receive the name with the most similar direction.
     """
 
     needs = Needs(modalities=("rgb",), all_cameras=True)

@@ -82,8 +82,8 @@ def named_as(
 ) -> dict[str, str]:
     """Names that another simulator uses for the cameras.
 
-    Cameras that have one of these names keep it. Others get the free name with the nearest
-    direction, or none if all are taken.
+    Cameras that have one of these names keep it. Others receive the free name with the nearest
+    direction, or no name if all are taken.
 
     Args:
         frames: one frame per camera, by its name in the scene.

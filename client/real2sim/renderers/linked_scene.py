@@ -38,8 +38,8 @@ class SceneLink(BaseModel):
 
     Attributes:
         scene: name of the worker's scene.
-        T_world_theirs: from their world to the scene's; None: the scene's own metadata, else the
-            identity.
+        T_world_theirs: transform from their world to the scene's; None: from the scene's metadata,
+            else the identity.
         offset_us: their time minus the scene's [us].
         cameras: the scene's cameras by their names.
         objects: the scene's objects by their ids, in addition to the ids from the scene's log.
@@ -167,7 +167,7 @@ class LinkedScene:
         Args:
             views: requested images, all at the same time.
             their_us: that time on their clock [us].
-            poses: [4, 4] of box centres in their world, by the scene's object ids.
+            poses: [4, 4] poses of box centres in their world, by the scene's object ids.
             others: as in ``client.scenes.view``.
 
         Raises:

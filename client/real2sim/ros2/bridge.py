@@ -150,7 +150,7 @@ class Ros2Bridge:
             return None
 
     def _publish(self, builder: MessageBuilder, obs: Observation) -> None:
-        # The clock is published first, so that no other message is from the future.
+        # Publish the clock first: no other message may be from the future.
         publish = self.node.publish
         publish("/clock", "rosgraph_msgs/msg/Clock", builder.clock(obs.t_us))
         publish("/tf", "tf2_msgs/msg/TFMessage", builder.ego_transform(obs))

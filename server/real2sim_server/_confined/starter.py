@@ -194,7 +194,7 @@ def _serve(control: socket.socket, children: dict[int, _Child]) -> bool:
 
 
 def _load(name: str) -> None:
-    """Load a module of the program before the fork, so that children need no memory for it.
+    """Load a module of the program before the fork; children then share its memory.
 
     Late imports of its functions are listed in its ``LOADED_EARLY``.
     """

@@ -155,7 +155,7 @@ def plan_gait(
     Args:
         body: body of the person.
         times: [N] increasing [s].
-        positions: [N, 3] of the body's origin on the ground, world frame [m].
+        positions: [N, 3] positions of the body's origin on the ground, world frame [m].
         yaws: [N], direction that the body faces [rad].
         style: walking style.
 

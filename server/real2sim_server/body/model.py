@@ -132,7 +132,7 @@ class Body:
         shape: [<= K] coefficients.
         vertices: [V, 3], body frame [m].
         joints: [J, 3] [m].
-        height: from the ground to the top of the head [m].
+        height: height from the ground to the top of the head [m].
     """
 
     model: BodyModel

@@ -1,4 +1,4 @@
-"""From a scenario state to the instances for the renderer and the targets of LiDARs."""
+"""Converts a scenario state to instances for the renderer and targets for LiDARs."""
 
 from __future__ import annotations
 

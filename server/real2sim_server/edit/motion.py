@@ -48,8 +48,8 @@ class AppliedOperation:
     Attributes:
         state: state after the operation.
         inverse: operation that reverts it.
-        touched: id of the object for review; None if there is none.
-        created: id of the new object; None if there is none.
+        touched: id of the object to review, or None.
+        created: id of the new object, or None.
     """
 
     state: ScenarioState

@@ -25,8 +25,8 @@ class LogEntry:
     Attributes:
         revision: increases by one with each entry, from 1.
         kind: edit, undo or redo.
-        operations: of an edit; empty for an undo or redo. Long logs may store them unparsed and
-            validate each on access.
+        operations: operations of an edit; empty for an undo or redo. Long logs may store them
+            unparsed and validate each on access.
         target: revision of the edit that was undone or redone; None for an edit.
         created_at: UTC, ISO 8601.
         who: name given by the client; empty without one.

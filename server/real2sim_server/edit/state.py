@@ -75,7 +75,7 @@ class ObjectState:
     Attributes:
         object_id: unique in the scenario, also among deleted objects.
         source_id: scene object with its Gaussians; empty if it shows an asset.
-        category: as in the scene.
+        category: category in the scene.
         size: (length, width, height) in the scene, before ``scale`` [m].
         scale: factors along the object's x, y, z, about its origin.
         trajectory: ``T_world_object``; origin at the box centre; exists only in its range.
@@ -135,7 +135,7 @@ class ScenarioState:
     """All objects of a scenario at one revision. Immutable; edits create states that share parts.
 
     Attributes:
-        objects: by id in a stable order: those of the scene, then copies in order of creation.
+        objects: objects by id in a stable order: scene objects, then copies by creation.
         next_instance_id: instance id of the next new object.
         time_range: first and last time of the scene's clock [us].
         clock: first and last time of the scenario, within ``time_range`` [us].
@@ -245,7 +245,7 @@ class EditError(ValueError):
         code: UNKNOWN_OBJECT, INVALID_OPERATION, STALE_REVISION, NOTHING_TO_UNDO or
             NOTHING_TO_REDO.
         hint: suggested next step, or None.
-        index: of the rejected operation in its batch, or None.
+        index: index of the rejected operation in its batch, or None.
     """
 
     def __init__(

@@ -133,7 +133,7 @@ class PlacedObjects(Generic[T]):
     """The K objects that exist at one instant.
 
     Attributes:
-        objects: in the state's order.
+        objects: objects in the state's order.
         sizes: [K, 3] float64, (length, width, height) of their boxes [m].
         positions: [K, 3] float64, box centres in the world [m].
         quaternions: [K, 4] float64, wxyz.

@@ -285,7 +285,7 @@ class ScoreStatistics:
 
     @classmethod
     def of(cls, values: Sequence[float]) -> ScoreStatistics | None:
-        """Statistics of values; None if there are no values."""
+        """Statistics of values; None for no values."""
         if not values:
             return None
         deviation = statistics.pstdev(values) if len(values) > 1 else None

@@ -92,7 +92,7 @@ MAX_FILE_BYTES = 1 << 20
 Role = Literal["observe", "drive", "edit", "administer"]
 """Permissions of a token."""
 ROLES: tuple[Role, ...] = ("observe", "drive", "edit", "administer")
-"""In increasing order; each role includes the previous ones."""
+"""Roles in increasing order; each includes the previous ones."""
 
 Rate = Annotated[float, Field(gt=0, le=1e15, allow_inf_nan=False)]
 
@@ -448,7 +448,7 @@ class Accounts:
         """Update the usage on other workers from their reports.
 
         Args:
-            told: by worker ``{name: [sessions, jobs]}``.
+            told: reports ``{name: [sessions, jobs]}`` by worker.
         """
         sums: dict[str, Held] = {}
         for held in told:

@@ -32,9 +32,9 @@ class AuditEntry:
         account: name of the token; empty without a valid one.
         client: address of the client.
         worker_id: worker that answered.
-        method, path: of the request.
+        method, path: method and path of the request.
         status: status of the reply.
-        request_id: as in the reply and the log.
+        request_id: request id in the reply and the log.
         at_us: wall clock [us].
     """
 

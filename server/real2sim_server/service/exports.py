@@ -324,7 +324,7 @@ async def make_dataset(
 
     Raises:
         JobCancelled: the job was cancelled.
-        DatasetError: as :func:`export_dataset`.
+        DatasetError: from :func:`export_dataset`.
         ServiceError: QUOTA_EXCEEDED, before or during the export.
     """
     if dry_run:

@@ -107,7 +107,7 @@ def blurred(
     Args:
         view: view of one camera, with the motion of its vehicle and of the visible objects.
         blur: exposure time and number of samples.
-        draw: renders the colour image of such a view.
+        draw: renders the colour image of a view.
     """
     total: Light | None = None
     for k in range(blur.samples):

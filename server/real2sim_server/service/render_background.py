@@ -39,7 +39,7 @@ from .preflight import awaited, compile_in_background
 log = structlog.get_logger(__name__)
 
 NICENESS = 10
-"""Niceness of the compiling process; the worker keeps rendering meanwhile."""
+"""Niceness of the compiling process; the worker keeps rendering during compilation."""
 
 
 class BackgroundCompile:

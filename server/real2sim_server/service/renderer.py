@@ -1,4 +1,4 @@
-"""From instances to encoded frames: rendering on the engine, encoding on other threads."""
+"""Renders instances to frames on the engine, and encodes frames on other threads."""
 
 from __future__ import annotations
 

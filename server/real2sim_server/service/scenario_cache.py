@@ -399,7 +399,7 @@ class ScenarioCache:
         """The scenario, locked against other changes.
 
         Raises:
-            ServiceError: as :meth:`get`, or INVALID_OPERATION for a recording.
+            ServiceError: see :meth:`get`; also INVALID_OPERATION for a recording.
         """
         check_made(scenario_id)
         while True:

@@ -243,7 +243,7 @@ class Scenarios:
         idempotent: IdempotentRequest,
         who: str = "",
     ) -> OperationResult:
-        """Undo the last edit in effect. Raises as :meth:`edit`, or NOTHING_TO_UNDO."""
+        """Undo the last edit in effect. Raises like :meth:`edit`; also NOTHING_TO_UNDO."""
         result = await self._change(
             scenario_id, lambda s: s.plan_undo(who=who), expected, idempotent=idempotent
         )
@@ -258,7 +258,7 @@ class Scenarios:
         idempotent: IdempotentRequest,
         who: str = "",
     ) -> OperationResult:
-        """Redo the last undone edit. Raises as :meth:`edit`, or NOTHING_TO_REDO."""
+        """Redo the last undone edit. Raises like :meth:`edit`; also NOTHING_TO_REDO."""
         result = await self._change(
             scenario_id, lambda s: s.plan_redo(who=who), expected, idempotent=idempotent
         )

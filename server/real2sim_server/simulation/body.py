@@ -60,7 +60,7 @@ WHEELS_SLEEP_TIME = 0.2
 
 
 class BodyMode(IntEnum):
-    """How a body moves."""
+    """The motion mode of a body."""
 
     SLEEPING = 0
     RIGID = 1
@@ -99,7 +99,8 @@ class DeformableBody:
         shape: shape after earlier deformation, or None.
 
     Attributes:
-        acceleration: [3] of the centre of mass in the last deforming step; else zero [m/s^2].
+        acceleration: [3] acceleration of the centre of mass in the last deforming step [m/s^2];
+            zero in other modes.
     """
 
     def __init__(

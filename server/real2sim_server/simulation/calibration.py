@@ -456,7 +456,7 @@ def calibrate_object(
     on_run: Callable[[int], None] | None = None,
     cancelled: Callable[[], bool] | None = None,
 ) -> ObjectCalibration:
-    """Fit factors so that the simulation matches the observations.
+    """Fit factors on initial values that make the simulation match the observations.
 
     Args:
         scene, state, options: simulation with initial values; its duration follows from the

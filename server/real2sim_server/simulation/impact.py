@@ -127,7 +127,7 @@ def object_body(
         friction: friction coefficient of its surface.
 
     Raises:
-        ParticleError: as ``fill_object``.
+        ParticleError: from ``fill_object``.
     """
     spacing = _spacing(size)
     filling = fill_object(cloud, size, spacing=spacing, mass=mass, category=category)

@@ -41,7 +41,7 @@ class ObjectResult:
         spacing: particle spacing [m].
         rest: [N, 3] float32, particles at rest, object frame [m].
         positions, quaternions: [F, 3] float64 [m], [F, 4] wxyz: ``T_world_object``.
-        velocities, angular_velocities: [F, 3] of the centre of mass, world frame [m/s], [rad/s].
+        velocities, angular_velocities: [F, 3] at the centre of mass, world frame [m/s], [rad/s].
         modes: [F] uint8, value of ``body.BodyMode``.
         shape_index: [F] int32, row of ``shapes`` at each frame; -1 if undeformed.
         shapes: [S, N, 3] float16, particle displacements, object frame [m].

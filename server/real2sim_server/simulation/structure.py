@@ -29,8 +29,8 @@ from ..physics.materials import (
 
 # A vehicle is a stiff core with yielding zones around it: front and rear, sides (door, sill and B
 # pillar together) and roof. Each zone has a force-deflection curve from published tests.
-# :func:`vehicle_structure` derives materials so that the particles of a zone carry that force; the
-# closed loop uses the same values per area of overlap.  Front and rear have two layers in series.
+# :func:`vehicle_structure` derives materials whose particles carry the force of their zone; the
+# closed loop uses the same values per area of overlap. Front and rear have two layers in series.
 # The outer one (bumper, skin, headlamps, attachments) folds at low force and slowly recovers. The
 # inner one (rails) keeps its crush. This reproduces a car with 0.6 m dynamic crush, a rebound at a
 # fraction of its speed, and 0.26 m residual crush.
@@ -159,7 +159,7 @@ def vehicle_structure(
         particles: particles at rest, vehicle frame (x forward, z up); their masses sum to its mass.
         spacing: particle spacing [m].
         section_height: height of the ends if the particles are a central column of the vehicle [m];
-            such a column has no sides and no roof.
+            a column has no sides and no roof.
     """
     structure = STRUCTURES[category]
     low = particles.positions.min(axis=0) - spacing / 2

@@ -181,7 +181,7 @@ COLUMNS: Mapping[str, type] = {
     "impact_object": str,
     "impact_kind": str,
 }
-"""Measured columns of every episode; without wall-clock times, so that tables are comparable."""
+"""Measured columns of every episode, without wall-clock times, to keep tables comparable."""
 
 
 def recipe_of(scene: str, scenes: Path | None, metrics: Sequence[str] = ()) -> Recipe:

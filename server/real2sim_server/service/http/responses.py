@@ -437,8 +437,8 @@ async def large_response(
 ) -> Response:
     """A reply with a large model, built and encoded on another thread.
 
-    It is encoded in parts: one call for all of a scene's trajectories would hold the GIL for tens
-    of milliseconds and block the event loop.
+    It is encoded in parts. One call for all trajectories of a scene would hold the GIL for tens of
+    milliseconds and block the event loop.
     """
     content = await asyncio.to_thread(lambda: json_in_pieces(build()))
     return Response(content, status, dict(headers or {}), "application/json")

@@ -430,7 +430,7 @@ def _made(
 WALL_GAP = 0.5
 """Initial gap between vehicle and wall [m]: contact after 1 s at 0.5 m/s."""
 DROP_HEIGHT = 1.225
-"""Free fall of 0.5 s [m]."""
+"""Drop height: free fall of 0.5 s [m]."""
 DAMPED = FixedCorotated(young=2e6, poisson=0.4, density=200.0, viscosity=1.5e4)
 """The paper's material for the fall, with damping. The undamped material of the paper rebounds by a
 third of the height for a block of this size; this viscosity leaves a slight bounce."""
