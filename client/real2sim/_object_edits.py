@@ -117,7 +117,7 @@ class ObjectEdits(Handle, Generic[R]):
 
     @property
     def yaw(self) -> float:
-        """Its heading in the world when it appears [rad]."""
+        """Heading in the world when it appears [rad]."""
         w, x, y, z = self._track.quaternions[0]
         return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 

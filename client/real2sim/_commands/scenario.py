@@ -158,7 +158,7 @@ def edit(
 ) -> None:
     """Apply a file of operations to a scenario, all or none.
 
-    With --scene, the new scenario is deleted if the edit fails, and always with --dry-run.
+    With --scene, the new scenario is deleted if the edit fails or with --dry-run.
     """
     if (scene is None) == (scenario is None):
         raise typer.BadParameter("give exactly one of --scene and --scenario")

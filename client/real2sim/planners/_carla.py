@@ -129,7 +129,7 @@ class AutonomousAgent:
 
 
 def _thinned(route: Sequence[Any]) -> list[int]:
-    """Route points that an agent keeps: the ends, option changes, and points in between."""
+    """Indices of the route points to keep: the ends, option changes, and points in between."""
     kept, way = [0], 0.0
     for k in range(1, len(route)):
         way += route[k][0].location.distance(route[k - 1][0].location)

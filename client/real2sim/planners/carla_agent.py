@@ -98,7 +98,7 @@ class _AgentNeeds(Needs):
 
 
 class CarlaAgent:
-    """Runs an agent of the CARLA leaderboard against a session.
+    """Runs an agent of the CARLA leaderboard in a session.
 
     Images of its cameras are assembled from those of the scene, by direction and field of view.
     ``gnss``, ``imu`` and ``speedometer`` are exact; other sensors are refused.
@@ -357,7 +357,7 @@ def _views_in(obs: Observation) -> dict[str, PinholeView]:
 
 
 def _smaller(view: PinholeView, width: int) -> PinholeView:
-    """The same view with fewer pixels."""
+    """The view with fewer pixels."""
     shrunk = min(width / view.size[0], 1.0)
     size = max(round(view.size[0] * shrunk), 1), max(round(view.size[1] * shrunk), 1)
     K = np.diag([size[0] / view.size[0], size[1] / view.size[1], 1.0]) @ view.K

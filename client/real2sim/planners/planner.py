@@ -57,7 +57,7 @@ class Needs:
 
     Attributes:
         modalities: modalities of its cameras; empty if it uses no images.
-        cameras: camera names; empty: the camera that points most nearly straight ahead.
+        cameras: camera names; empty: the most forward-looking camera.
         all_cameras: whether it uses every camera of the scene instead.
         width: image width [px]; None: as recorded.
         privileged: whether observations list all objects.

@@ -130,7 +130,7 @@ class _Child:
 
 
 def main() -> None:
-    """Serve the socket that is standard input until it is closed."""
+    """Serve requests on standard input, a socket, until it is closed."""
     control = socket.socket(fileno=os.dup(0))
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     woken, wake = os.pipe()

@@ -363,7 +363,7 @@ class _Motion:
         return ankle, start + smooth(p) * (end - start), pitch, toes
 
     def _sizes(self, walk: Footsteps) -> Float:
-        """Lengths of a foot's swings against the leg's [K]."""
+        """[K] lengths of a foot's swings, relative to the leg length."""
         return np.linalg.norm(np.diff(walk.spots, axis=0), axis=1) / self.body.leg_length  # type: ignore[no-any-return]
 
     def _off_angle(self, size: Float) -> Float:

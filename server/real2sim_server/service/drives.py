@@ -310,7 +310,7 @@ class Drives:
         """Let a planner drive, and save the recording when the episode ends.
 
         Raises:
-            ServiceError: as for jobs.
+            ServiceError: the errors of ``Jobs.start``.
         """
         row = seat.session.row
 
@@ -350,7 +350,7 @@ class Drives:
         """Video source of a finished drive, seen from its own vehicle.
 
         Raises:
-            ServiceError: UNKNOWN_JOB, JOB_NOT_DONE, JOB_FAILED; or as for the scene cache.
+            ServiceError: UNKNOWN_JOB, JOB_NOT_DONE, JOB_FAILED; also the errors of the scene cache.
         """
         drive = self._opened.get(job_id)
         if drive is None:

@@ -149,7 +149,7 @@ class Renderer:
         )
 
     def close(self) -> None:
-        """End its threads."""
+        """End the renderer's threads."""
         self.levels.close()
         self.small_images.close()
         self._encoders.shutdown(cancel_futures=True)
@@ -502,7 +502,7 @@ MSGPACK = "application/msgpack"
 
 
 def choose_frames_type(accept: str | None, modalities: Sequence[Modality]) -> str:
-    """The same for images of these modalities: msgpack, or for one image any of its formats."""
+    """The media type for images of these modalities: msgpack, or an image format for one image."""
     if len(modalities) == 1:
         return choose_media_type(accept, modalities[0])
     return choose_among([MSGPACK], accept, of="more than one image")

@@ -64,7 +64,7 @@ from .library.scenes import SceneCache
 from .scenarios import Scenarios
 
 NEARBY_DISTANCE = 25.0
-"""Objects within this distance of a moving one take part [m], up to ``MAX_NEARBY_OBJECTS``."""
+"""Objects this close to a moving one are simulated too [m], up to ``MAX_NEARBY_OBJECTS``."""
 
 MAX_NEARBY_OBJECTS = 12
 PLAYBACK = "playback.json"
@@ -178,7 +178,7 @@ def _with_values(
     """Physics values of the objects, with some replaced.
 
     Raises:
-        ServiceError: UNKNOWN_OBJECT for values of an object that does not take part.
+        ServiceError: UNKNOWN_OBJECT for values of an object that is not simulated.
     """
     unknown = [name for name in values if name != "*" and name not in objects]
     if unknown:
@@ -549,7 +549,7 @@ class Calibrations:
         """Start a calibration on the scenario's current revision.
 
         Raises:
-            ServiceError: as for a simulation; UNKNOWN_OBJECT for an object that does not take part.
+            ServiceError: as for a simulation; UNKNOWN_OBJECT for an object that is not simulated.
             PhysicsError: observations that do not fit the simulation.
         """
         view = await self._scenarios.view(scenario_id)

@@ -396,7 +396,7 @@ class ScenarioCache:
 
     @asynccontextmanager
     async def locked(self, scenario_id: str) -> AsyncIterator[CachedScenario]:
-        """The scenario, locked against other changes.
+        """Lock a scenario against other changes during the block.
 
         Raises:
             ServiceError: see :meth:`get`; also INVALID_OPERATION for a recording.
@@ -405,7 +405,7 @@ class ScenarioCache:
         while True:
             cached = await self.get(scenario_id)
             async with cached.lock:
-                # The previous holder of the lock may have evicted or deleted it.
+                # The previous holder of the lock may have evicted or deleted the scenario.
                 if self._cached.get(scenario_id) is cached:
                     yield cached
                     return

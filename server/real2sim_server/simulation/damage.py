@@ -134,7 +134,7 @@ GROUND = 0.3
 SLANT, HEIGHT = 0.6, 0.8
 """Light from one side: horizontal offset from the normal at rest, and vertical component."""
 AHEAD = np.array([0.45, 0.4, 0.0])
-"""Its horizontal direction for surfaces that face up."""
+"""Horizontal direction of this light for surfaces that face up."""
 DARKEST, BRIGHTEST = 0.35, 1.7
 DENT = (0.03, 0.14)
 """Depths at which dented sheet starts to crumple, and is fully crumpled [m]."""

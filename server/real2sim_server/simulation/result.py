@@ -451,7 +451,7 @@ class _Damaged:
         return row, tuple(loose)
 
     def cloud(self, shown: int, time_s: float) -> GaussianCloud:
-        """Its Gaussians in the shape ``shown``, ``time_s`` [s] after the start."""
+        """The vehicle's Gaussians in the shape ``shown``, ``time_s`` [s] after the start."""
         if self._most is None or self._upto > shown:
             self._upto, self._most = 0, None
         for row in range(self._upto, shown + 1):

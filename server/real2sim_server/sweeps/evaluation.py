@@ -445,7 +445,7 @@ class Evaluator:
         )
 
     def reference(self, drive: Drive) -> Drove:
-        """The same episode, driven by the reference driver."""
+        """Drive the same episode with the reference driver."""
         world = begin(self.scene, drive, Needs(), privileged=False)
         if drive.operations:
             world.apply(OPERATIONS.validate_python([dict(o) for o in drive.operations]))

@@ -266,7 +266,7 @@ class LoopHistogram(Collector):
         return [HistogramMetricFamily(self._name, self._text, labels=self._labels)]
 
     def collect(self) -> Iterable[Metric]:
-        """Every series, on the thread that exposes metrics."""
+        """Collect every series, on the thread that exposes metrics."""
         family = HistogramMetricFamily(self._name, self._text, labels=self._labels)
         bounds = [*map(floatToGoString, self._bounds), "+Inf"]
         for value, durations in list(self._series.items()):

@@ -62,7 +62,7 @@ class LibraryAsset:
 
     @property
     def nbytes(self) -> int:
-        """Memory of its Gaussians, including relit copies for scenes [bytes]."""
+        """Memory of the Gaussians, including relit copies for scenes [bytes]."""
         with self._lock:
             clouds = [self.asset.cloud, *self._lit.values()]
         # Relit clouds share all tensors except colours.
@@ -71,7 +71,7 @@ class LibraryAsset:
 
     @property
     def asset_id(self) -> str:
-        """Its name in the library."""
+        """Id of the asset in the library."""
         return self.asset.asset_id
 
     @property
@@ -101,12 +101,12 @@ class LibraryAsset:
 
     @property
     def ambient(self) -> Colour | None:
-        """Mean colour of its original surroundings."""
+        """Mean colour of the asset's original surroundings."""
         given = self.asset.provenance.get("ambient")
         return tuple(given) if given is not None else None
 
     def cloud_in(self, scene: Scene) -> GaussianCloud:
-        """Its Gaussians relit for ``scene``, on the scene's device."""
+        """The asset's Gaussians, relit for ``scene``, on the scene's device."""
         found = self._lit.get(scene)
         if found is None:
             cloud = self.asset.cloud.to(scene.background.device)

@@ -242,7 +242,7 @@ class ImportQueue:
         self._taken = 0
 
     def close(self) -> None:
-        """Start no further imports."""
+        """Stop starting imports."""
         self._thread.shutdown(wait=False, cancel_futures=True)
 
     @contextmanager
