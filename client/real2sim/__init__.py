@@ -192,7 +192,7 @@ def make_env(**options: Any) -> DriveEnv:
 
 
 def __getattr__(name: str) -> Any:
-    # Names are fetched when they are used, so that importing the package costs nothing.
+    # Names are imported on first use, which keeps ``import real2sim`` fast.
     if name not in __all__:
         said = ""
         if not name.startswith("_"):

@@ -23,7 +23,7 @@ from ._session_state import Matrix
 DRIVER = "egodriver.EgodriverService"
 RENDERER = "nre.grpc.protos.sensorsim.SensorsimService"
 MAX_MESSAGE_BYTES = 64 * 1024 * 1024
-"""As of AlpaSim's own channels."""
+"""Message limit of AlpaSim's own channels."""
 
 COMMON = {
     "Empty": "",
@@ -133,7 +133,7 @@ DRIVER_METHODS = {
     "drive": ("DriveRequest", "DriveResponse"),
     "get_version": ("Empty", "VersionId"),
 }
-"""Request and answer of the calls that are made."""
+"""Request and reply types of the driver's methods, which Real2Sim calls."""
 
 RENDERER_METHODS = {
     "render_rgb": ("RGBRenderRequest", "RGBRenderReturn"),
@@ -147,7 +147,7 @@ RENDERER_METHODS = {
     "get_available_trajectories": ("AvailableTrajectoriesRequest", "AvailableTrajectoriesReturn"),
     "get_available_ego_masks": ("Empty", "AvailableEgoMasksReturn"),
 }
-"""Request and answer of the calls that are served."""
+"""Request and reply types of the renderer's methods, which Real2Sim serves."""
 
 
 @functools.cache

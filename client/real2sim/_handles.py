@@ -67,7 +67,7 @@ def guided(function: F) -> F:
         try:
             return function(*args, **kwargs)
         except TypeError as error:
-            # The traceback of an error from inside the function has more frames.
+            # Errors raised inside the function have more frames in their traceback.
             if error.__traceback__ is None or error.__traceback__.tb_next is not None:
                 raise
             taken = [p for p in inspect.signature(function).parameters if p != "self"]
@@ -129,12 +129,12 @@ class ScenarioState(Handle):
 
     @property
     def revision(self) -> int:
-        """Revision that the next edit is sent against."""
+        """Revision that the next edit is based on."""
         return self._revision
 
     @property
     def storyboard(self) -> Storyboard | None:
-        """Storyboard of sessions that set none themselves, or None."""
+        """Default storyboard of the scenario's sessions, or None."""
         return self._info.storyboard
 
     def __repr__(self) -> str:
@@ -231,12 +231,12 @@ def session_and_token(session: Any) -> tuple[str | None, str | None]:
 
 
 def optional_scene_name(scene: SceneRef | None) -> str | None:
-    """As :func:`scene_name`; None stays None."""
+    """Like :func:`scene_name`; returns None for None."""
     return None if scene is None else scene_name(scene)
 
 
 def optional_scenario_id(scenario: ScenarioRef | None) -> str | None:
-    """As :func:`scenario_id_of`; None stays None."""
+    """Like :func:`scenario_id_of`; returns None for None."""
     return None if scenario is None else scenario_id_of(scenario)
 
 
@@ -255,7 +255,7 @@ MAX_POLL_S = 1.0
 
 
 class JobBase(Handle):
-    """State of a job that this client has seen last, shared by the sync and the async variant."""
+    """Last fetched state of a job; base of the sync and the async handle."""
 
     _instead: ClassVar = {
         "done": "job.info.over",
@@ -300,7 +300,7 @@ def poll_delays(job_id: str, timeout: float | None) -> Iterator[float]:
 
 
 def require_success(info: JobInfo) -> None:
-    """Raises Real2SimError, of the kind of its problem, unless the job has succeeded."""
+    """Raise the Real2SimError of the job's problem, unless the job has succeeded."""
     if info.state is JobState.SUCCEEDED:
         return
     if info.error is None:

@@ -96,13 +96,13 @@ class Target:
         return f"{'wss' if scheme == 'https' else 'ws'}://{rest}/v1/sessions/{session_id}/drive"
 
     def codec(self, codec: str) -> str:
-        """'auto' made concrete: raw on loopback, where copying beats coding; else jpeg."""
+        """Resolve 'auto': raw on loopback, where copying is faster than encoding; else jpeg."""
         if codec != "auto":
             return codec
         return "raw" if self.loopback else "jpeg"
 
     def image_codec(self, codec: str, modality: str) -> str:
-        """'auto' made concrete for an image of a modality; only rgb has a lossy codec."""
+        """Resolve 'auto' for an image of a modality; only rgb has a lossy codec."""
         if codec == "auto" and modality != "rgb":
             return "raw"
         return self.codec(codec)
@@ -120,7 +120,7 @@ def resolve_target(
     """Resolve a target from arguments; for None, from the environment, then the defaults.
 
     Raises:
-        ValueError: invalid address; the message says if it comes from the environment.
+        ValueError: invalid address; the message says whether it comes from the environment.
     """
     found = url or os.environ.get(URL_VARIABLE) or DEFAULT_URL
     if token is None:
@@ -141,7 +141,7 @@ UNREACHABLE_HINT = "start a worker with `real2sim serve`, or check the address"
 
 def client_options(target: Target) -> dict[str, Any]:
     """Arguments of an HTTP client for a worker."""
-    # A proxy from the environment cannot reach a worker on this machine.
+    # A proxy set in the environment cannot reach a worker on this machine.
     return {
         "base_url": target.url,
         "headers": target.headers,
@@ -152,7 +152,7 @@ def client_options(target: Target) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def request_options(target: Target, request: Request) -> Iterator[dict[str, Any]]:
-    """Arguments of one request; a file that it uploads is open for the length of the block."""
+    """Arguments of one request; the uploaded file, if any, stays open within the block."""
     options: dict[str, Any] = {
         "params": request.params,
         "headers": request.headers,
@@ -197,7 +197,7 @@ def timeout_of(target: Target, request: Request) -> float:
 
 
 def accepted_reply(response: httpx2.Response, request: Request) -> Reply:
-    """The reply in a response. Raises Real2SimError where the worker refuses the request."""
+    """The reply in a response. Raises Real2SimError if the worker refuses the request."""
     headers = {name.lower(): value for name, value in response.headers.items()}
     reply = Reply(response.status_code, headers, response.content)
     # A proxy may send the same status with a different body.
@@ -208,7 +208,7 @@ def accepted_reply(response: httpx2.Response, request: Request) -> Reply:
 
 
 class Attempts:
-    """Counts the tries of one request."""
+    """Counts the attempts of one request."""
 
     def __init__(self, policy: RetryPolicy, request: Request) -> None:
         self._policy = policy
@@ -216,7 +216,7 @@ class Attempts:
         self._made = 0
 
     def delay_after(self, error: Real2SimError) -> float | None:
-        """Seconds until the next try, or None for no retry."""
+        """Seconds until the next attempt; None to give up."""
         attempt, self._made = self._made, self._made + 1
         # After a long wait, a retry would only add load to a slow worker.
         waited = self._request.long_timeout and isinstance(error, ReplyTimeoutError)

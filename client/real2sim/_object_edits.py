@@ -89,7 +89,7 @@ class ObjectEdits(Handle, Generic[R]):
 
     @property
     def info(self) -> ObjectInfo:
-        """The object after the newest edit; once it is deleted, as it was last."""
+        """The object after the newest edit; for a deleted object, its last state."""
         for known in self._scenario.info.objects:
             if known.object_id == self._info.object_id:
                 self._info = known
@@ -117,7 +117,7 @@ class ObjectEdits(Handle, Generic[R]):
 
     @property
     def yaw(self) -> float:
-        """Its heading in the world when it appears [rad]."""
+        """Heading in the world when it appears [rad]."""
         w, x, y, z = self._track.quaternions[0]
         return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
@@ -138,7 +138,7 @@ class ObjectEdits(Handle, Generic[R]):
             ``position`` of the centre of its box in the world [m] and ``quaternion`` (wxyz).
 
         Raises:
-            ValueError: the object is not there at that instant.
+            ValueError: the object does not exist at that instant.
 
         Examples:
             >>> scenario.objects["car_blue"].pose(1.0).position
@@ -224,8 +224,8 @@ class ObjectEdits(Handle, Generic[R]):
         """Rotate the object [rad]; times as in :meth:`translate`.
 
         Args:
-            angle: [rad].
-            axis: of any length.
+            angle: angle [rad].
+            axis: rotation axis, of any length.
             frame: frame of the axis, ``world`` or ``object``.
             start_us, end_us, blend_us: as in :meth:`translate`.
             about_us: rotates the path too, about the object's position at this time [us]. By
@@ -336,7 +336,7 @@ class ObjectEdits(Handle, Generic[R]):
         restitution: float | None = None,
         grid: int | None = None,
     ) -> R:
-        """Set physical properties; those you omit return to their defaults.
+        """Set physical properties; omitted ones return to their defaults.
 
         Args:
             mass: [kg].
@@ -388,7 +388,7 @@ class ObjectEdits(Handle, Generic[R]):
         width: float | None = None,
         phase: int | None = None,
     ) -> R:
-        """Set the gait of a person of the body model; values you omit return to the person's own.
+        """Set the gait of a person of the body model; omitted values return to the person's own.
 
         Args:
             stride: factor on stride length, 0.5 to 1.6.
@@ -654,7 +654,7 @@ def insertion(
     object_id: str | None,
     snap: bool,
 ) -> Operation:
-    """The operation that puts an asset somewhere for the whole time range."""
+    """The operation that inserts an asset at a pose, for the whole time range."""
     pose = checked(Pose, position=position, quaternion=quaternion)
     return checked(Insert, asset_id=asset, object_id=object_id, pose=pose, size=size, snap=snap)
 

@@ -1,4 +1,4 @@
-"""One function per REST call: builds the request and parses the answer.
+"""One function per REST call: builds the request and parses the reply.
 
 All functions are pure. The sync and the async client share them and differ only in the I/O.
 """
@@ -113,7 +113,7 @@ RadarSensor: TypeAlias = str | RadarSpec | Mapping[str, Any]
 
 
 class ResetOptions(TypedDict, total=False):
-    """Options of reset, besides its sensors; meaning and defaults as in ``ResetSpec``."""
+    """Options of reset except its sensors; meaning and defaults as in ``ResetSpec``."""
 
     lidars: Sequence[LidarSensor]
     radars: Sequence[RadarSensor]
@@ -261,7 +261,7 @@ def render_scene(scene: str, view: ViewRequest) -> Call[Image]:
 
 
 def view_scene(scene: str, body: SceneView) -> Call[View]:
-    """Changes nothing, so it may be sent again."""
+    """Safe to retry: it changes nothing."""
     request = Request(
         "POST",
         f"/v1/scenes/{segment(scene)}/render",
@@ -504,7 +504,7 @@ def delete_session(session_id: str, token: str | None) -> Call[None]:
 
 
 def step_session(session_id: str, token: str | None, body: StepRequest) -> Call[SessionState]:
-    """Moves the clock, so it is never sent twice."""
+    """Not retried: it advances the clock."""
     request = Request(
         "POST",
         f"{_session(session_id)}/step",
@@ -528,7 +528,7 @@ def session_state(session_id: str, token: str | None, after: int | None) -> Call
 
 
 def session_clock(session_id: str, token: str | None, body: SessionClock) -> Call[SessionInfo]:
-    """Not sent twice: steps of it would pass twice."""
+    """Not retried: the steps would run twice."""
     request = Request(
         "PUT",
         f"{_session(session_id)}/clock",
@@ -566,7 +566,7 @@ def record_session(session_id: str, token: str | None, frames: bool) -> Call[byt
 def render_session(
     session_id: str, token: str | None, sensors: Sequence[SensorSpec], ranging: Mapping[str, Any]
 ) -> Call[View]:
-    """Never moves time, so it may be sent again."""
+    """Safe to retry: it does not advance the clock."""
     body = checked(SessionRender, sensors=list(sensors), **ranging)
     request = Request(
         "POST",

@@ -1,7 +1,7 @@
-"""The ``real2sim`` command: the client's commands, and those that installed packages add.
+"""The ``real2sim`` command: the client's commands and those of installed packages.
 
 Packages add commands through the entry-point group ``real2sim.commands``; each entry is a Typer
-app whose commands appear beside the client's own.
+app, and its commands are listed together with the client's own.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ PANELS = {
     "Data": "export-dataset train-policy",
     "Operate": "serve status token store backup restore bench",
 }
-"""Commands by panel of the help, in its order; those of other packages follow."""
+"""Commands by panel, in the order of the help; commands of other packages follow."""
 
 
 def main() -> None:
@@ -43,7 +43,7 @@ def main() -> None:
 
 
 def build_app() -> typer.Typer:
-    """The command with everything that is installed."""
+    """The command with the subcommands of all installed packages."""
     app = typer.Typer(
         name="real2sim",
         cls=_Panels,
@@ -51,7 +51,7 @@ def build_app() -> typer.Typer:
         no_args_is_help=True,
         add_completion=False,
         pretty_exceptions_enable=False,
-        # Rich's own markup would take units in square brackets for styles, and drop them.
+        # Rich's own markup would read units in square brackets as styles and drop them.
         rich_markup_mode="markdown",
     )
     app.callback(invoke_without_command=True)(_options)
@@ -65,7 +65,7 @@ def build_app() -> typer.Typer:
         try:
             app.add_typer(entry.load())
         except Exception as error:
-            # A broken extension must not take the client's own commands away.
+            # A broken extension must not disable the client's own commands.
             typer.echo(f"warning: the commands of {entry.value!r} are missing: {error}", err=True)
     return app
 
@@ -87,7 +87,7 @@ class _Panels(TyperGroup):
 
 
 def print_error(error: Exception) -> None:
-    """One sentence about what went wrong, and what to do, on standard error."""
+    """Print the error in one sentence, and a hint, to standard error."""
     said = str(error.args[0]) if isinstance(error, KeyError) and error.args else str(error)
     known = isinstance(error, ValueError | OSError | KeyError) or hasattr(error, "hint")
     sentence = said if said and known else f"{type(error).__name__}: {said or 'no reason given'}"

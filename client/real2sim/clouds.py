@@ -107,7 +107,7 @@ class PointCloud(Handle):
         return self.count
 
     def in_world(self) -> NDArray[np.float64]:
-        """Points [N, 3] float64 in the world, as of a compensated cloud [m].
+        """Points [N, 3] float64 in the world frame, with motion compensation [m].
 
         Examples:
             >>> cloud.in_world().shape == (cloud.count, 3)
@@ -166,7 +166,7 @@ class PointCloud(Handle):
 
 
 class LidarCloud(PointCloud):
-    """A sweep of a LiDAR: one point for each return; rays without one are absent."""
+    """A sweep of a LiDAR: one point per return; rays without a return are absent."""
 
     @property
     def intensity(self) -> NDArray[np.float32]:
@@ -175,12 +175,12 @@ class LidarCloud(PointCloud):
 
     @property
     def ring(self) -> NDArray[np.uint16]:
-        """[N] uint16 row of a turning sensor, in its model's order; 0 of others."""
+        """[N] uint16 row of a spinning sensor, in its model's order; 0 for other sensors."""
         return self._column("ring")
 
     @property
     def time_us(self) -> NDArray[np.int32]:
-        """[N] int32 when each ray was fired, relative to ``t_us``; 0 or less."""
+        """[N] int32 time at which each ray was fired, relative to ``t_us``; at most 0 [us]."""
         return self._column("time_us")
 
     @property
@@ -190,26 +190,26 @@ class LidarCloud(PointCloud):
 
 
 class RadarCloud(PointCloud):
-    """A scan of a radar: one point for each detection, the nearest first."""
+    """A scan of a radar: one point per detection, nearest first."""
 
     @property
     def range(self) -> NDArray[np.float32]:
-        """[N] float32 [m]."""
+        """[N] float32 distance [m]."""
         return self._column("range")
 
     @property
     def azimuth(self) -> NDArray[np.float32]:
-        """[N] float32, from the sensor's x towards y [rad]."""
+        """[N] float32 angle from the sensor's x axis towards y [rad]."""
         return self._column("azimuth")
 
     @property
     def elevation(self) -> NDArray[np.float32]:
-        """[N] float32, upwards [rad]."""
+        """[N] float32 angle upwards [rad]."""
         return self._column("elevation")
 
     @property
     def velocity(self) -> NDArray[np.float32]:
-        """[N] float32 radial, relative to the sensor; below 0 when nearing [m/s]."""
+        """[N] float32 radial velocity relative to the sensor; negative when approaching [m/s]."""
         return self._column("velocity")
 
     @property
@@ -219,12 +219,12 @@ class RadarCloud(PointCloud):
 
     @property
     def snr(self) -> NDArray[np.float32]:
-        """[N] float32 power above that which is just detected [dB]."""
+        """[N] float32 power above the detection threshold [dB]."""
         return self._column("snr")
 
     @property
     def kind(self) -> NDArray[np.uint8]:
-        """[N] uint8: 0 something is there, 1 clutter, 2 a ghost."""
+        """[N] uint8: 0 for a real target, 1 for clutter, 2 for a ghost."""
         return self._column("kind")
 
 
@@ -232,11 +232,10 @@ KINDS = {"lidar": LidarCloud, "radar": RadarCloud}
 
 
 def cloud_from_wire(wire: WireCloud) -> PointCloud:
-    """The cloud of a message, its matrices checked; of a modality that newer workers have a plain
-    one.
+    """Parse the cloud in a message; an unknown modality gives a plain :class:`PointCloud`.
 
     Raises:
-        MalformedReplyError: matrices of another shape.
+        MalformedReplyError: a matrix has the wrong shape.
     """
     kind = KINDS.get(wire.modality, PointCloud)
     return kind(
@@ -254,7 +253,7 @@ def cloud_from_wire(wire: WireCloud) -> PointCloud:
 
 
 def clouds_by_sensor(wires: Sequence[WireCloud]) -> dict[str, PointCloud]:
-    """Clouds by the names of their sensors."""
+    """Clouds by sensor name."""
     return {wire.sensor: cloud_from_wire(wire) for wire in wires}
 
 

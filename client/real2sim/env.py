@@ -34,7 +34,7 @@ ACCELERATION, BRAKING, STEERING = 4.0, 8.0, 0.6
 """Accelerations of the actions 1 and -1 [m/s^2], and steering angle of the action 1 [rad]."""
 
 ENV_ID = "real2sim/Drive-v0"
-"""For ``gymnasium.make``, once this module is imported."""
+"""Id for ``gymnasium.make``; importing this module registers it."""
 
 WAYPOINTS = 20
 FAR = 1e4
@@ -47,9 +47,9 @@ AGENT_FIELDS = 9
 POINTS = 8192
 """Default number of LiDAR rows in observations."""
 DETECTIONS = 256
-"""Rows of a radar."""
+"""Number of radar rows in observations."""
 CLOUD_FIELDS = {"lidar": ("intensity",), "radar": ("velocity", "rcs")}
-"""Columns behind x, y, z."""
+"""Columns after x, y, z."""
 
 FORMS: dict[str, tuple[float, type[np.generic]]] = {
     "rgb": (255, np.uint8),
@@ -201,7 +201,7 @@ class DriveEnv(gymnasium.Env[Obs, NDArray[np.float32]]):
 
     @property
     def last(self) -> Observation:
-        """The newest observation, whole."""
+        """The newest observation, with all fields."""
         return self._last
 
     def close(self) -> None:
@@ -249,7 +249,7 @@ class DriveEnv(gymnasium.Env[Obs, NDArray[np.float32]]):
             self._images[name] = np.minimum(image, most).astype(dtype)
         for name, cloud in obs.clouds.items():
             self._clouds[name] = _rows_of(cloud, self._rows[cloud.modality])
-        # Copies, so that changing an observation in place does not change the next one.
+        # Copies: changing an observation in place must not change the next one.
         kept = {**self._images, **self._clouds}
         return seen | {name: array.copy() for name, array in kept.items()}
 

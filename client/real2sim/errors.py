@@ -90,7 +90,7 @@ class MalformedReplyError(Real2SimError):
 
 
 class ImageDecodeError(Real2SimError):
-    """An image cannot be turned into an array here; its bytes are still there."""
+    """An image cannot be decoded here; its encoded bytes are still available."""
 
 
 class NotOpenError(Real2SimError):
@@ -135,7 +135,7 @@ class StatusError(Real2SimError):
     """
 
     def __init__(self, details: ErrorDetails) -> None:
-        # Many workers include the first of the errors in the detail.
+        # Many workers include the first error in the detail.
         unsaid = [e for e in details.errors if e.message not in details.detail]
         places = "; ".join(f"{e.pointer or '/'}: {e.message}" for e in unsaid)
         message = f"{details.detail} ({places})" if places else details.detail
@@ -154,7 +154,7 @@ class InvalidRequestError(StatusError):
 
 
 class InvalidOperationError(InvalidRequestError):
-    """An edit names something that does not exist or cannot be done."""
+    """An edit refers to something that does not exist, or cannot be applied."""
 
 
 class InvalidActionError(InvalidRequestError):
@@ -162,7 +162,7 @@ class InvalidActionError(InvalidRequestError):
 
 
 class UnauthorizedError(StatusError):
-    """The token is missing, wrong, or not enough for this."""
+    """The token is missing or wrong, or lacks the permission."""
 
 
 class NotFoundError(StatusError):
@@ -170,7 +170,7 @@ class NotFoundError(StatusError):
 
 
 class ConflictError(StatusError):
-    """The request does not fit the state that the worker is in."""
+    """The request conflicts with the current state of the worker."""
 
 
 class StaleRevisionError(ConflictError):
@@ -188,7 +188,7 @@ class StaleRevisionError(ConflictError):
 
 
 class StepConflictError(ConflictError):
-    """This step was answered before, with other content."""
+    """This step was already answered, with different content."""
 
 
 class StaleStepError(ConflictError):
@@ -228,7 +228,7 @@ class WorkerFailedError(StatusError):
 
 
 class GatewayError(WorkerFailedError):
-    """A proxy answers that the worker behind it is gone; another one may be there soon."""
+    """A proxy reports that the worker behind it is gone; another one may replace it soon."""
 
 
 _BY_CODE: dict[str, type[StatusError]] = {

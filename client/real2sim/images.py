@@ -35,8 +35,8 @@ HUES = np.array([[37, 151, 211], [101, 67, 173], [23, 59, 131]])
 def preview_jpeg(array: NDArray[Any], modality: str) -> bytes:
     """Encode an image as jpeg, with false colours unless it is ``rgb``.
 
-    Near surfaces and certain pixels are bright. Each number of ``instance`` and ``semantic`` has a
-    distinct colour; 0 is black.
+    Near surfaces and pixels with low uncertainty are bright. Each number of ``instance`` and
+    ``semantic`` has a distinct colour; 0 is black.
 
     Args:
         array: pixels, see :class:`~.images.Image`.
@@ -149,14 +149,14 @@ class Image(Handle):
         return np.array(self.array, dtype=dtype, copy=copy)
 
     def __getitem__(self, key: Any) -> Any:
-        """Pixels, as of :attr:`array`."""
+        """Pixels of :attr:`array` at an index."""
         return self.array[key]
 
     def __len__(self) -> int:
         return len(self.array)
 
     def _repr_jpeg_(self) -> bytes:
-        """For notebooks: the image itself, depth and numbers in grey and colours."""
+        """For notebooks: rgb as it is, depth in grey, numbers in false colours."""
         if self.codec == "jpeg":
             return self.data
         return preview_jpeg(self.array, self.modality)
@@ -254,14 +254,14 @@ class PlacedFrame(Frame):
 
 
 def frame_from_wire(wire: WireFrame, pixels: memoryview | None = None) -> Frame:
-    """The frame of a message, its matrices checked.
+    """Parse the frame in a message.
 
     Args:
         wire: the frame.
-        pixels: of a raw image in shared memory, as many bytes as its shape needs.
+        pixels: bytes of a raw image in shared memory; their number matches the image's shape.
 
     Raises:
-        MalformedReplyError: matrices of another shape; shared memory of another codec.
+        MalformedReplyError: a matrix has the wrong shape, or an image in shared memory is not raw.
     """
     kind = Frame if pixels is None else PlacedFrame
     frame = kind(
@@ -278,7 +278,7 @@ def frame_from_wire(wire: WireFrame, pixels: memoryview | None = None) -> Frame:
     if pixels is not None:
         if wire.codec != "raw":
             raise MalformedReplyError(f"an image of codec {wire.codec!r} in shared memory")
-        # The cache slot of the cached properties.
+        # Cached properties store their value in ``__dict__``.
         del frame.__dict__["data"]
         frame.__dict__["array"] = _raw_array(frame, pixels)
     return frame
@@ -287,7 +287,7 @@ def frame_from_wire(wire: WireFrame, pixels: memoryview | None = None) -> Frame:
 def frames_by_camera(
     wires: Sequence[WireFrame], pixels: Sequence[memoryview | None] = ()
 ) -> dict[str, Mapping[str, Frame]]:
-    """Frames by camera, then by modality; ``pixels`` as of :func:`frame_from_wire`, for each."""
+    """Frames by camera, then by modality; ``pixels`` of each as in :func:`frame_from_wire`."""
     frames: dict[str, dict[str, Frame]] = {}
     for wire, found in zip(wires, pixels or [None] * len(wires), strict=True):
         frames.setdefault(wire.sensor, {})[wire.modality] = frame_from_wire(wire, found)
@@ -308,7 +308,7 @@ def write_atomically(path: Path, data: bytes) -> None:
 
 
 def matrix_from_wire(value: Any, shape: tuple[int, int], name: str) -> NDArray[np.float64]:
-    """A matrix of a frame. Raises MalformedReplyError: it has another shape."""
+    """A matrix of a frame. Raises MalformedReplyError if it has another shape."""
     try:
         matrix = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -319,7 +319,7 @@ def matrix_from_wire(value: Any, shape: tuple[int, int], name: str) -> NDArray[n
 
 
 def encoded_shape(data: bytes, codec: str) -> tuple[int, ...]:
-    """Shape of the array in a jpeg or png; empty where its head is broken."""
+    """Shape of the array in a jpeg or png; empty if the header is broken."""
     if codec == "png" and data[12:16] == b"IHDR" and len(data) > 25:
         width, height = (int.from_bytes(data[k : k + 4], "big") for k in (16, 20))
         return (height, width, 3) if data[25] == 2 else (height, width)

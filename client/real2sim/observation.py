@@ -108,7 +108,7 @@ class View(Handle):
         )
 
     def lidar(self, name: str | None = None) -> LidarCloud:
-        """The sweep of a LiDAR; default: of the only one.
+        """The sweep of a LiDAR; default: the only LiDAR.
 
         Raises:
             KeyError: no such LiDAR; the message names the available ones.
@@ -122,7 +122,7 @@ class View(Handle):
         return self._cloud(name, LidarCloud)
 
     def radar(self, name: str | None = None) -> RadarCloud:
-        """The scan of a radar. Name and KeyError as of :meth:`lidar`.
+        """The scan of a radar. Name and KeyError as in :meth:`lidar`.
 
         Examples:
             >>> with real2sim.connect() as other, other.session(scene="street") as driven:
@@ -226,10 +226,11 @@ def observation_from_wire(obs: Obs, pixels: Sequence[memoryview | None] = ()) ->
 
     Args:
         obs: the message.
-        pixels: of its images in shared memory, None for each other image; default: none.
+        pixels: one entry per image: its bytes in shared memory, or None; default: no image is in
+            shared memory.
 
     Raises:
-        MalformedReplyError: a route or matrix of another shape.
+        MalformedReplyError: a route or matrix has the wrong shape.
     """
     route = np.asarray(obs.route, dtype=np.float64)
     if route.size == 0:
@@ -270,7 +271,7 @@ def view_from_frames(
     pixels: Sequence[memoryview | None] = (),
     clouds: Sequence[WireCloud] = (),
 ) -> View:
-    """The view in a message; ``pixels`` as of :func:`observation_from_wire`."""
+    """Parse the view in a message; ``pixels`` as in :func:`observation_from_wire`."""
     return View(
         t_us=t_us,
         revision=revision,

@@ -37,7 +37,7 @@ class Guided:
 
         def __getattr__(self, name: str) -> Any:
             kind = type(self).__name__
-            # Libraries probe private names; nobody reads that error.
+            # Libraries probe private names and catch the error; a hint is not useful.
             if name.startswith("_"):
                 raise AttributeError(f"{kind!r} object has no attribute {name!r}")
             said = advice(name, attributes(self), instead_of(type(self)))
@@ -93,7 +93,7 @@ def _unit(quaternion: tuple[float, float, float, float]) -> tuple[float, float, 
             f"quaternion {quaternion!r} has length {norm:.6g}; a rotation needs a unit one, wxyz"
         )
     if abs(norm - 1.0) < 1e-15:
-        # Kept bit for bit, so that reading stored values changes nothing.
+        # Unit quaternions are kept bit for bit: reading stored values must not change them.
         return quaternion
     w, x, y, z = quaternion
     return (w / norm, x / norm, y / norm, z / norm)
@@ -124,8 +124,8 @@ def bearer_token(text: str) -> str:
 
 
 def one_of(values: Any) -> Any:
-    """Field of an answer with one of a ``Literal``'s values; newer workers may send others, which
-    readers accept."""
+    """Field of a reply with one of a ``Literal``'s values. Newer workers may send other values, and
+    readers accept them."""
     return Field(json_schema_extra={"enum": list(get_args(values))})
 
 

@@ -27,7 +27,7 @@ MAX_CLIENT_MESSAGE_BYTES = 1024 * 1024
 
 
 SMALL_ARRAY_BYTES = 4096
-"""Smaller arrays are copied: describing them would take longer."""
+"""Smaller arrays are copied, which is faster than referring to them."""
 
 _LITTLE = {np.dtype(name): name for name in ARRAY_DTYPES}
 _SENT_AS = _LITTLE | {dtype.newbyteorder(">"): name for dtype, name in _LITTLE.items()}
@@ -114,7 +114,7 @@ def _pack_array(value: object) -> msgpack.ExtType:
 
 @functools.lru_cache(maxsize=256)
 def _array_head(dtype: str, shape: tuple[int, ...], size: int) -> bytes:
-    """Header of an array with ``size`` bytes; cached, since few shapes occur."""
+    """Header of an array with ``size`` bytes; cached because few shapes occur."""
     payload: bytes = msgpack.packb([dtype, shape, bytes(size)])
     return payload[: len(payload) - size]
 

@@ -26,9 +26,9 @@ SEMANTIC_CLASSES: dict[str, int] = {
     "motorcycle": 32,
     "bicycle": 33,
 }
-"""Number in the image by name. ``static`` is the background, ``ground`` its driven or walked part
-(within 15 cm of the fitted ground's height), ``dynamic`` an object of another category, and
-``unlabeled`` an empty pixel in a scene without sky."""
+"""Number in the image by class name. ``static`` is the background. ``ground`` is its drivable or
+walkable part, within 15 cm of the fitted ground's height. ``dynamic`` is an object of another
+category, and ``unlabeled`` an empty pixel in a scene without sky."""
 
 CLASS_OF_CATEGORY = {
     "car": "car",

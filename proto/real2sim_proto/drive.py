@@ -78,7 +78,7 @@ Slot = Annotated[
 
 
 def check_asked(*asked: Sequence[object]) -> None:
-    """Raises ValueError if there is nothing to render."""
+    """Raise ValueError if there is nothing to render."""
     if not any(asked):
         raise ValueError("the request is empty; name sensors, lidars or radars")
 

@@ -27,7 +27,7 @@ PlanPoses = Annotated[
 
 
 def check_times(times_us: list[int], poses: int) -> None:
-    """Check that there is one time per pose and that times increase; else raise ValueError."""
+    """Raise ValueError unless each pose has a time and the times increase."""
     if len(times_us) != poses:
         raise ValueError(f"{len(times_us)} times for {poses} poses")
     if any(map(operator.ge, times_us, times_us[1:])):

@@ -1,8 +1,7 @@
 """JSON Schema of every message, for planners in other languages.
 
-``python -m real2sim_proto.schema DIR`` writes one file per message, as the documentation site shows
-them. Each file is complete, except that storyboards are in ``Storyboard.json``, to which the others
-refer.
+``python -m real2sim_proto.schema DIR`` writes one file per message, as shown on the documentation
+site. Each file is complete, except for storyboards: other files refer to ``Storyboard.json``.
 """
 
 from __future__ import annotations
@@ -116,8 +115,8 @@ def schemas() -> dict[str, dict[str, Any]]:
 
 
 def _referring(schema: dict[str, Any]) -> dict[str, Any]:
-    """The schema with references to the files of SHARED, without definitions that only they
-    need."""
+    """The schema with references to the files of SHARED, and without the definitions that only
+    those files need."""
     files = {f"#/$defs/{name}": f"{name}.json" for name in SHARED}
     definitions = _renamed(schema.pop("$defs", {}), files)
     found: dict[str, Any] = _renamed(schema, files)
@@ -138,7 +137,7 @@ def _renamed(part: Any, files: dict[str, str]) -> Any:
 
 
 def _references(part: Any) -> set[str]:
-    """Names of the definitions of the same file that a part refers to."""
+    """Names of the definitions in the same file that a part of a schema refers to."""
     if isinstance(part, dict):
         own = part.get("$ref", "")
         found = {own.rsplit("/", 1)[1]} if own.startswith("#/$defs/") else set()

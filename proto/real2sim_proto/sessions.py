@@ -168,7 +168,7 @@ class SessionRender(Model):
 MAX_POSED = 4096
 
 MIN_FOCAL = 0.1
-"""[px]."""
+"""Minimum focal length [px]."""
 
 Pixels = Annotated[float, Field(ge=-1e6, le=1e6)]
 Row = tuple[Pixels, Pixels, Pixels]

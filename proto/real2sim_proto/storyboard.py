@@ -356,7 +356,7 @@ def resolved(board: Storyboard) -> Storyboard:
     Raises:
         ValueError: an expression without a value, or with an invalid one.
     """
-    # Content without expressions is shared, so that it is validated once.
+    # Content without expressions is shared and validated only once.
     if not any(_has_expression(getattr(board, name)) for name in _RESOLVED):
         return board
     fields = {name: _plain(getattr(board, name)) for name in type(board).model_fields}

@@ -20,10 +20,10 @@ ParameterName = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,39}$")]
 SweepSeed = Annotated[int, Field(ge=0, lt=2**63)]
 
 MAX_POINTS = 1_000_000
-"""Points of a sweep, wherever it is driven."""
+"""Maximum number of points of a sweep, on a worker or by the command."""
 
 MAX_EPISODES = 10_000
-"""That one job drives; a sweep of the command may be larger."""
+"""Maximum number of episodes of one job; sweeps of the command can be larger."""
 
 SET_BY_SWEEPS = frozenset({"seed", "sensors", "action", "privileged"})
 """Fields of reset that a case cannot set: the seed, and those that depend on the planner."""
@@ -269,13 +269,13 @@ class SweepRequest(Model):
 
     def _check_search(self) -> None:
         if len(self.planners) != 1:
-            raise ValueError(f"{len(self.planners)} planners; a search is of one")
+            raise ValueError(f"{len(self.planners)} planners; a search tests exactly one")
         only = sorted({"seeds", "stop", "metrics", "worst", "rank_by"} & self.model_fields_set)
         if only:
-            raise ValueError(f"{only[0]!r} is of sweeps; a search chooses its episodes itself")
+            raise ValueError(f"{only[0]!r} is an option of sweeps; a search chooses its own episodes")
 
     def most_episodes(self) -> int:
-        """Episodes that it drives at most."""
+        """Maximum number of episodes."""
         method = self.method
         if isinstance(method, SearchMethod):
             return method.episodes
@@ -295,8 +295,8 @@ def _grid_points(method: GridMethod, parameters: Mapping[str, SweepParameter]) -
 
 
 def with_kinds(fields: Mapping[str, Any]) -> dict[str, Any]:
-    """Fields of a sweep with omitted kinds filled in: of parameters from their members, of the
-    method if only its kind is given."""
+    """Fields of a sweep with omitted kinds filled in: for parameters from their members, and for
+    the method if it is only a name."""
     filled = dict(fields)
     given = fields.get("parameters")
     if isinstance(given, Mapping):

@@ -1,4 +1,4 @@
-"""Connecting to a worker."""
+"""The client of a worker."""
 
 from __future__ import annotations
 

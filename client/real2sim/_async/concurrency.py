@@ -1,4 +1,4 @@
-"""How the async client waits. Its counterpart in ``_sync`` is written by hand too."""
+"""Waiting in the async client. The counterpart in ``_sync`` is also written by hand."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Lookup(Handle):
 
 
 async def sleep(seconds: float) -> None:
-    """Wait."""
+    """Wait for a number of seconds."""
     await asyncio.sleep(seconds)
 
 

@@ -243,7 +243,8 @@ class AsyncJob(JobBase):
 
         Raises:
             ReplyTimeoutError: the job did not end in time.
-            Real2SimError: it failed, was cancelled or interrupted; the subclass tells which.
+            Real2SimError: the job failed, was cancelled or was interrupted; the subclass says
+                which.
 
         Examples:
             >>> stages = []
@@ -331,10 +332,12 @@ class AsyncSweeps:
 
         Args:
             scene: its name.
-            parameters: by name, as in ``real2sim sweep``: ``{"low": 2, "high": 20}`` and others,
-                with a ``path`` into ``reset``, or without one if the scenario has the parameter.
-            corner_case, openscenario, storyboard: what happens, at most one: a case of the gallery,
-                the text or path of an OpenSCENARIO file, a storyboard in the scene's frame.
+            parameters: parameters by name, as in ``real2sim sweep``, such as
+                ``{"low": 2, "high": 20}``; with a ``path`` into ``reset``, or without one if the
+                scenario has the parameter.
+            corner_case, openscenario, storyboard: the traffic; set at most one of them. A case of
+                the gallery, the text or path of an OpenSCENARIO file, or a storyboard in the
+                scene's frame.
             ego: entity of the file that is the ego; default: ``Ego``.
             leave_out: elements of the file to ignore.
             reset: options of the episodes.

@@ -51,7 +51,7 @@ class AsyncScenarios(AsyncCollection[ScenarioInfo]):
     """
 
     async def create(self, scene: SceneRef, name: str = "") -> AsyncScenario:
-        """Create a scenario without edits on a scene.
+        """Create a new scenario of a scene, without edits.
 
         Raises:
             NotFoundError: no such scene.
@@ -125,8 +125,10 @@ class AsyncScenarios(AsyncCollection[ScenarioInfo]):
         return (await self._transport.send(_requests.gallery())).cases
 
     async def gallery_picture(self, name: str) -> bytes:
-        """A corner case from above, as an SVG document: the paths of the road users and where they
-        meet an ego that drives straight on (blue).
+        """A top view of a corner case, as an SVG document.
+
+        It shows the paths of the road users, and where they meet an ego that drives straight ahead
+        (blue).
 
         Raises:
             NotFoundError: the gallery has no such case.
@@ -326,11 +328,11 @@ class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
         Args:
             start_us, end_us: default: the scenario's span.
             frame_us: time between stored frames.
-            objects: objects that the physics moves; default: those with a velocity or physics of
-                their own. ``ego`` is the recording vehicle.
+            objects: objects that the physics moves; default: those with their own velocity or
+                physics. ``ego`` is the recording vehicle.
             preset: how objects become bodies: ``vehicle`` (default) or ``paper`` (default of the
                 paper's experiments).
-            physics: by object, or ``"*"`` for all: values as in ``set_physics``, for this rollout.
+            physics: values as in ``set_physics``, by object or ``"*"`` for all; for this rollout.
             gravity: [m/s^2]; default: 9.81 downwards.
             max_particles: maximum for all bodies together.
             experiment: ``wall``, ``pair``, ``drop`` of the paper, ``frontal``, ``t_bone``, ``pole``
@@ -446,7 +448,7 @@ class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
         """Write the centres of the Gaussians as a ply with colour, normal, class and instance.
 
         Args:
-            path: of the ply file.
+            path: path of the ply file.
             t, t_us: time in seconds or in microseconds; default: the start.
             part: ``all``, ``background`` or ``objects``.
 

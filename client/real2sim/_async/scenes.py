@@ -332,7 +332,7 @@ class AsyncAssets(AsyncCollection[AssetInfo]):
 
         Args:
             asset_id: an unused id.
-            build: for example ``woman``, ``tall_man``, ``old_woman``, ``boy``.
+            build: body shape, such as ``woman``, ``tall_man``, ``old_woman`` or ``boy``.
             height: height of the person [m]; default: that of the build.
             clothes: RGB in [0, 1] of ``skin``, ``hair``, ``top``, ``trousers``, ``shoes``.
             worn: any of ``long_hair``, ``skirt``.
@@ -371,7 +371,7 @@ class AsyncAssets(AsyncCollection[AssetInfo]):
         Args:
             path: the file.
             asset_id: default: the file's name.
-            category: for example ``car``, ``truck``, ``pedestrian``.
+            category: category, such as ``car``, ``truck`` or ``pedestrian``.
             up_axis: axis of the file that points up: ``z``, ``y`` or ``-y``; default: as declared
                 in the file (spz and exported ply), else ``-y``. ``provenance["up_axis"]`` of the
                 asset reports it.

@@ -1,4 +1,4 @@
-"""Sends requests and waits for the answers; collections; reconnecting."""
+"""Requests and replies, collections, and reconnecting."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ class AsyncTransport:
         self._http = httpx2.AsyncClient(transport=transport, **client_options(target))
 
     async def send(self, call: Call[T]) -> T:
-        """The parsed answer; retried if that is safe.
+        """Send a request and return the parsed reply; retries if that is safe.
 
         Raises:
-            Real2SimError: no answer, or the worker refuses.
+            Real2SimError: there is no reply, or the worker refuses the request.
         """
         attempts = Attempts(self.target.policy, call.request)
         while True:
@@ -39,7 +39,7 @@ class AsyncTransport:
             except Real2SimError as error:
                 delay = attempts.delay_after(error)
                 if delay is None:
-                    # The traceback of the caller is useful; the frames below are always the same.
+                    # Keep the caller's traceback; the frames below it are always the same.
                     raise error.with_traceback(None) from error.__cause__
             await sleep(delay)
 
@@ -96,7 +96,7 @@ async def outlast(
         passes: whether an error is temporary.
 
     Raises:
-        Real2SimError: from the last try, or not temporary.
+        Real2SimError: from the last attempt, or not temporary.
     """
     until = time.monotonic() + seconds
     for attempt in range(MAX_RECONNECTS):
@@ -122,7 +122,7 @@ async def reconnect(
         seconds: period in which retries start.
 
     Raises:
-        UnreachableError, CapacityError, ReplyTimeoutError: from the last try.
+        UnreachableError, CapacityError, ReplyTimeoutError: from the last attempt.
         Real2SimError: the worker refuses.
     """
     until = time.monotonic() + seconds

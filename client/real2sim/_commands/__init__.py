@@ -1,1 +1,1 @@
-"""The client's commands, a module each. Nothing heavy is imported before a command runs."""
+"""The client's commands, one module each. Heavy imports are deferred until a command runs."""

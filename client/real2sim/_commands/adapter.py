@@ -1,4 +1,4 @@
-"""``real2sim adapter`` renders for other simulators, ``real2sim ros2`` makes a ROS 2 node."""
+"""``real2sim adapter`` renders for other simulators; ``real2sim ros2`` runs a ROS 2 node."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def _serve(what: str) -> None:
         signal.signal(number, lambda *_: stop.set())
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
     typer.echo(what)
-    # Without a timeout no signal would be seen on every platform.
+    # On some platforms, a wait without a timeout blocks signals.
     while not stop.wait(1.0):
         pass
 

@@ -168,10 +168,10 @@ def _names(text: str) -> list[str]:
 def _reset_options(
     reset: str | None, flags: Mapping[str, tuple[str, Any]], spawn: str | None
 ) -> dict[str, Any]:
-    """Options of reset: those of ``--reset``, and of the flags that are given.
+    """Options of reset, from ``--reset`` and from the flags that were passed.
 
     Raises:
-        typer.BadParameter: no JSON object, or an option that is given twice.
+        typer.BadParameter: not a JSON object, or an option that was passed twice.
     """
     options = json_object("--reset", reset)
     agents = options.get("agents", {})
@@ -179,13 +179,13 @@ def _reset_options(
         if value is None:
             continue
         if name in options:
-            raise typer.BadParameter(f"{name} is given by {flag} and in --reset; give it once")
+            raise typer.BadParameter(f"{name} is set by both {flag} and --reset; set it once")
         if name != "sensors":
             options[name] = value
     if spawn is not None:
         if "spawn" in agents:
             raise typer.BadParameter(
-                "agents.spawn is given by --spawn and in --reset; give it once"
+                "agents.spawn is set by both --spawn and --reset; set it once"
             )
         options["agents"] = {**agents, "spawn": json_object("--spawn", spawn)}
     return options
@@ -194,16 +194,16 @@ def _reset_options(
 def _sensors(
     names: list[str], width: int | None, needed: list[dict[str, Any]]
 ) -> list[dict[str, Any]]:
-    """What the planner needs, and rgb of the cameras asked for.
+    """Sensor specs: the planner's cameras, and rgb for the cameras in ``names``.
 
-    ``width`` holds for all but cameras of which the planner needs a width of its own, and that
-    nobody else asks for.
+    ``width`` applies to every camera, except those that only the planner uses and for which it
+    requires another width.
     """
     sensors = {s["camera"]: s | {"width": s["width"] or width} for s in needed}
     for name in names:
         sensor = sensors.setdefault(name, {"camera": name, "modalities": [], "width": None})
         both = {*sensor["modalities"], "rgb"}
-        # Pictures to keep and pictures to drive by share one size.
+        # A camera has one image size, for the planner and for saved images.
         sensors[name] = sensor | {"modalities": sorted(both), "width": width or sensor["width"]}
     return list(sensors.values())
 
@@ -216,7 +216,7 @@ def _named(  # noqa: PLR0917, one for each way to name a session
     scenario: str | None,
     codec: str,
 ) -> Any:
-    """A session of one's own, or one that is there already."""
+    """A new session, or an existing one if ``session`` is set."""
     if session is None:
         return client.session(scene=scene, scenario=scenario, codec=codec)
     return client.join(session, token=token or "", codec=codec)
@@ -252,7 +252,7 @@ def _saver(folder: Path | None) -> Iterator[Callable[[Observation], None]]:
     if folder is None:
         yield lambda _obs: None
         return
-    # Coding and disk happen beside the loop, so that they do not slow what is measured.
+    # Encode and write in threads, to keep this work out of the measured loop.
     with ThreadPoolExecutor(2) as pool:
         pending = []
 

@@ -28,21 +28,21 @@ JsonFile = Annotated[
 ]
 
 DEFAULT_URL = "http://127.0.0.1:8600"
-"""As of ``real2sim.connect``, which would cost a command its quick start to import."""
+"""Same as the default of ``real2sim.connect``; importing that module would slow every command."""
 
 
 def connected(url: str, token: str | None, timeout: float = 30.0) -> Client:
-    """A client of the worker that the options name."""
+    """A client of the worker given by the options."""
     import real2sim
 
     return real2sim.connect(url, token=token, timeout=timeout)
 
 
 def json_object(flag: str, text: str | None) -> dict[str, Any]:
-    """The JSON object that a flag has; empty where it was not given.
+    """Parse the JSON object in a flag's value; empty if the flag is missing.
 
     Raises:
-        typer.BadParameter: it has none.
+        typer.BadParameter: the value is not a JSON object.
     """
     try:
         found = json.loads(text or "{}")
@@ -54,14 +54,14 @@ def json_object(flag: str, text: str | None) -> dict[str, Any]:
 
 
 def console() -> Console:
-    """Where tables go; not used with ``--json -``, which owns standard output."""
+    """Console for tables. Do not use it with ``--json -``, which writes to standard output."""
     from rich.console import Console
 
     return Console()
 
 
 def write_json(path: Path, figures: Any) -> None:
-    """Write figures atomically; '-' is standard output."""
+    """Write figures as JSON, atomically; '-' is standard output."""
     text = json.dumps(figures, indent=2, allow_nan=False) + "\n"
     if str(path) == "-":
         typer.echo(text, nl=False)
@@ -72,6 +72,6 @@ def write_json(path: Path, figures: Any) -> None:
 
 
 def save_image(image: Image, path: Path) -> None:
-    """Write an image and say so."""
+    """Write an image and print its path and size."""
     saved = image.save(path)
     typer.echo(f"wrote {saved} ({saved.stat().st_size / 1024:.0f} KiB)")

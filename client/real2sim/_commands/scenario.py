@@ -158,7 +158,7 @@ def edit(
 ) -> None:
     """Apply a file of operations to a scenario, all or none.
 
-    A new scenario is only kept where they apply, and never after --dry-run.
+    With --scene, the new scenario is deleted if the edit fails or with --dry-run.
     """
     if (scene is None) == (scenario is None):
         raise typer.BadParameter("give exactly one of --scene and --scenario")
@@ -183,7 +183,7 @@ def edit(
 def _edit_new(
     client: Client, scene: str, name: str, batch: list[Any], *, dry_run: bool
 ) -> tuple[str | None, OperationResult]:
-    """Id of the new scenario, None if it was not kept, and the result of the edit."""
+    """Edit a new scenario; return its id, or None if it was deleted, and the result of the edit."""
     from .. import Real2SimError
 
     handle = client.scenarios.create(scene=scene, name=name)
@@ -193,7 +193,7 @@ def _edit_new(
         kept = not dry_run
     finally:
         if not kept:
-            # What went wrong with the edit matters more than a scenario that stays behind.
+            # An error here would hide the error of the edit.
             with contextlib.suppress(Real2SimError):
                 client.scenarios.delete(handle)
     return handle.scenario_id if kept else None, result

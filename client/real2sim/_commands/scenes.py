@@ -1,4 +1,4 @@
-"""``real2sim status``, ``scenes`` and ``frame``: the worker, its scenes, and pictures of them."""
+"""``real2sim status``, ``scenes`` and ``frame``: the worker, its scenes, and images of them."""
 
 from __future__ import annotations
 

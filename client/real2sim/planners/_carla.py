@@ -34,22 +34,22 @@ class Vector3D:
     z: float = 0.0
 
     def length(self) -> float:
-        """Euclidean."""
+        """Euclidean length."""
         return math.sqrt(self.x**2 + self.y**2 + self.z**2)
 
 
 @dataclass
 class Location(Vector3D):
-    """[m]"""
+    """A position [m]."""
 
     def distance(self, other: Vector3D) -> float:
-        """To another location [m]."""
+        """Distance to another location [m]."""
         return math.dist((self.x, self.y, self.z), (other.x, other.y, other.z))
 
 
 @dataclass
 class Rotation:
-    """Degrees: pitch nose up, yaw to the right, roll with the right side down."""
+    """A rotation in degrees: pitch nose up, yaw to the right, roll with the right side down."""
 
     pitch: float = 0.0
     yaw: float = 0.0
@@ -115,13 +115,13 @@ class AutonomousAgent:
     def set_global_plan(
         self, global_plan_gps: Sequence[Any], global_plan_world_coord: Sequence[Any]
     ) -> None:
-        """Keep the route, thinned."""
+        """Store the route with fewer points."""
         kept = _thinned(global_plan_world_coord)
         self._global_plan = [global_plan_gps[k] for k in kept]
         self._global_plan_world_coord = [tuple(global_plan_world_coord[k]) for k in kept]
 
     def run_step(self, input_data: dict[str, Any], timestamp: float) -> VehicleControl:
-        """The command for now."""
+        """The command for the current step."""
         return VehicleControl()
 
     def destroy(self) -> None:
@@ -129,7 +129,7 @@ class AutonomousAgent:
 
 
 def _thinned(route: Sequence[Any]) -> list[int]:
-    """Rows of a route that an agent keeps: its ends, where its option changes, and in between."""
+    """Indices of the route points to keep: the ends, option changes, and points in between."""
     kept, way = [0], 0.0
     for k in range(1, len(route)):
         way += route[k][0].location.distance(route[k - 1][0].location)
@@ -144,7 +144,7 @@ STUBS: dict[str, tuple[Any, ...]] = {
     "agents.navigation.local_planner": (RoadOption,),
     "leaderboard.autoagents.autonomous_agent": (AutonomousAgent, Track),
 }
-"""Members of the stand-in modules."""
+"""Members of each stand-in module."""
 
 
 def install_stubs() -> None:
@@ -225,7 +225,7 @@ class Lookup:
         return tuple(name for name, *_ in self.parts)
 
     def image(self, images: Mapping[str, Pixels]) -> Pixels:
-        """[H, W, 3] of the view, out of the images of the cameras; black where none sees it."""
+        """Assemble the view [H, W, 3] from the cameras' images; unseen pixels are black."""
         width, height = self.size
         found = np.zeros((height * width, 3), np.uint8)
         for name, rows, around, weights in self.parts:
@@ -269,7 +269,7 @@ def _nearest_first(wanted: PinholeView, cameras: Mapping[str, PinholeView]) -> S
 def _around(
     places: Matrix, width: int, height: int
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """The four pixels around places [N, 2] of an image, and their weights (bilinear)."""
+    """The four pixels around positions [N, 2] in an image, and their bilinear weights."""
     place = places - 0.5
     low = np.floor(place)
     a, b = (place - low).T

@@ -1,8 +1,7 @@
 """Planners made for AlpaSim (NVIDIA 2025), unchanged: gRPC, ``EgodriverService``.
 
-AlpaSim's local frame is our world frame, shifted so that an episode begins at its origin, because
-its numbers are single precision. Its rig frame is the vehicle frame. Requires the ``alpasim``
-extra.
+AlpaSim's local frame is our world frame, shifted to the start of the episode, because AlpaSim uses
+single precision. Its rig frame is the vehicle frame. Requires the ``alpasim`` extra.
 """
 
 from __future__ import annotations
@@ -43,7 +42,7 @@ if TYPE_CHECKING:
     from ..observation import Observation
 
 PATIENCE = 50
-"""Answers without a plan at the start of a session, before it is given up."""
+"""Maximum number of answers without a plan at the start of a session."""
 WAYPOINTS, WAYPOINT_SPACING = 20, 80 / 19
 """Route points as AlpaSim sends them, and their spacing [m]; missing points are NaN."""
 ALPASIM_CAMERAS = {
@@ -121,7 +120,7 @@ class AlpasimDriver:
         )
 
     def reset(self, obs: Observation) -> None:
-        """Begin a session of the driver, and end the one before. Raises PeerError."""
+        """Begin a session of the driver, and end the previous one. Raises PeerError."""
         self._end_session()
         self._origin = np.array(obs.ego.position)
         self._last_us, self._without_plan, self._planned = -1, 0, False
@@ -225,7 +224,7 @@ class AlpasimDriver:
             self._call("submit_image_observation", request)
 
     def _continue_on_route(self, obs: Observation, said: str) -> TrajectoryPlan:
-        """On along the route at the speed of now."""
+        """A plan along the route at the current speed."""
         if not obs.warming_up:
             self._without_plan += 1
         if self._without_plan > self._patience:
@@ -341,7 +340,7 @@ class AlpasimDriver:
 
 
 ANGLE_TO_PIXELS = 2
-"""Which polynomial of an f-theta camera is the reference, in AlpaSim's count."""
+"""AlpaSim's enum value for the reference polynomial of an f-theta camera."""
 
 
 class _RefusalError(PeerError):
@@ -370,7 +369,7 @@ class _DriverNeeds(Needs):
     given: Mapping[str, str] = field(default_factory=dict)
 
     def sensors(self, cameras: Sequence[CameraInfo]) -> list[dict[str, Any]]:
-        """Sensors of the cameras that serve. Raises PeerError: none does for a name."""
+        """Specs of the matching cameras. Raises PeerError if no camera matches a name."""
         if not self.names:
             return super().sensors(cameras)
         chosen = cameras_for(self.names, looks_of(cameras), known=ALPASIM_CAMERAS, given=self.given)
@@ -381,7 +380,7 @@ class _DriverNeeds(Needs):
 
 
 def _split(target: str) -> tuple[str, dict[str, str]]:
-    """Address, and the cameras behind it: ``HOST:PORT?cameras=NAME:CAMERA,NAME``."""
+    """Split ``HOST:PORT?cameras=NAME:CAMERA,NAME`` into the address and the cameras by name."""
     address, _, query = target.partition("?")
     cameras: dict[str, str] = {}
     for key, value in parse_qsl(query, keep_blank_values=True):
@@ -393,7 +392,7 @@ def _split(target: str) -> tuple[str, dict[str, str]]:
 
 
 def _spaced(route: Matrix) -> Matrix:
-    """[20, 3] waypoints from the vehicle on as AlpaSim spaces them; nan where the route is over."""
+    """[20, 3] waypoints ahead of the vehicle, with AlpaSim's spacing; NaN past the route's end."""
     path = Path.along(route)
     wanted = np.arange(WAYPOINTS) * WAYPOINT_SPACING
     found = np.full((WAYPOINTS, 3), np.nan)

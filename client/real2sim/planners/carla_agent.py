@@ -47,24 +47,25 @@ MIN_SEEN, MAX_UNSEEN = 0.2, 0.1
 """Fractions of an agent's image: minimum seen, and maximum unseen without a warning."""
 
 EARTH_RADIUS = 6_378_137.0
-"""[m]"""
+"""Radius of CARLA's spherical earth [m]."""
 
 GRAVITY = 9.81
 
 # The longitudinal map, see command_of().
 FULL_THROTTLE, FULL_BRAKE = 4.0, 8.0
-"""[m/s^2]"""
+"""Acceleration at full throttle, and deceleration at full brake [m/s^2]."""
 TOP_SPEED = 50.0
-"""At which full throttle accelerates no more [m/s]."""
+"""Speed at which full throttle no longer accelerates [m/s]."""
 ROLLING, AIR = 0.15, 6e-4
-"""Deceleration by rolling [m/s^2], and by the air per squared speed [1/m]."""
+"""Deceleration by rolling resistance [m/s^2], and by air drag per squared speed [1/m]."""
 STEER_ANGLE = math.radians(70.0)
-"""Road-wheel angle at full steer of most of CARLA's cars [rad]."""
+"""Road-wheel angle of most CARLA cars at full steer [rad]."""
 STEERING_CURVE = ((0.0, 20.0, 60.0, 120.0), (1.0, 0.9, 0.8, 0.7))
 """Fraction of full steering at speeds [km/h], as in CARLA."""
 
 TURN_OVER, TURN = 15.0, 0.5
-"""A route turns where its heading changes by more than this [rad] so far before and behind [m]."""
+"""A route turns at a point if its heading changes by more than ``TURN`` [rad] between
+``TURN_OVER`` [m] before and after the point."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +98,7 @@ class _AgentNeeds(Needs):
 
 
 class CarlaAgent:
-    """Runs an agent of the CARLA leaderboard against a session.
+    """Runs an agent of the CARLA leaderboard in a session.
 
     Images of its cameras are assembled from those of the scene, by direction and field of view.
     ``gnss``, ``imu`` and ``speedometer`` are exact; other sensors are refused.
@@ -112,7 +113,7 @@ class CarlaAgent:
                 (default: 42, 2 degrees, as in CARLA's leaderboard).
 
         Raises:
-            PeerError: there is no such agent, or it requires something unavailable.
+            PeerError: the agent does not exist or requires something unavailable.
             ValueError: an unknown option.
         """
         where, options = _split(target)
@@ -133,7 +134,7 @@ class CarlaAgent:
         self.needs: Needs = _AgentNeeds(modalities=modalities, action="control", views=cameras)
 
     def begin(self, welcome: Welcome) -> None:
-        """Take the route of the session."""
+        """Store the route of the session."""
         route = welcome.route
         self._route = None if route is None else np.asarray(route, np.float64)
 
@@ -181,7 +182,7 @@ class CarlaAgent:
         return sensors
 
     def _made(self) -> Any:
-        """An agent that is set up."""
+        """Create an agent and call its setup."""
         parameters = list(inspect.signature(self._class).parameters)
         if len(parameters) == 1 and parameters[0] != "carla_host":
             # Leaderboard 1 passes the configuration to the constructor, which calls setup.
@@ -220,7 +221,7 @@ class CarlaAgent:
 
 
 def wanted_view(sensor: Mapping[str, Any]) -> PinholeView:
-    """The view of a camera as agents describe it: size [px], horizontal field of view and angles
+    """The view of a camera in an agent's format: size [px], horizontal field of view and angles
     [degrees]."""
     width, height = int(sensor["width"]), int(sensor["height"])
     focal = width / 2 / math.tan(math.radians(float(sensor["fov"])) / 2)
@@ -230,7 +231,7 @@ def wanted_view(sensor: Mapping[str, Any]) -> PinholeView:
 
 
 def camera_rotation(pitch: float, yaw: float, roll: float) -> Matrix:
-    """[3, 3] rotation of a camera's axes (x right, y down, z forward) in our vehicle frame, of
+    """[3, 3] rotation of a camera's axes (x right, y down, z forward) in our vehicle frame, from
     Unreal's angles [rad]: pitch nose up, yaw to the right, roll with the right side down."""
     cp, sp, cy, sy = math.cos(pitch), math.sin(pitch), math.cos(yaw), math.sin(yaw)
     cr, sr = math.cos(roll), math.sin(roll)
@@ -242,9 +243,9 @@ def camera_rotation(pitch: float, yaw: float, roll: float) -> Matrix:
 
 
 def geographic(x: float, y: float, lat: float, lon: float) -> tuple[float, float]:
-    """Latitude and longitude [degrees] of a point x (east), y (north) [m] of a world with its
-    origin at ``lat``, ``lon``: Mercator projection on a sphere, scaled to the origin, as in
-    CARLA."""
+    """Latitude and longitude [degrees] of a point x (east), y (north) [m] in a world with its
+    origin at ``lat``, ``lon``. As in CARLA, a Mercator projection on a sphere, scaled to the
+    origin."""
     scale = EARTH_RADIUS * math.cos(math.radians(lat))
     north = scale * math.log(math.tan(math.pi / 4 + math.radians(lat) / 2)) + y
     found = 2 * math.atan(math.exp(north / scale)) - math.pi / 2
@@ -262,8 +263,8 @@ def imu(ego: EgoState) -> NDArray[np.float64]:
 def global_plan(
     route: Matrix, lat: float, lon: float
 ) -> tuple[list[tuple[dict[str, float], Any]], list[tuple[Any, Any]]]:
-    """A route [R, 4] of x, y, z [m] and heading [rad] as agents get it: places in degrees and as
-    CARLA's transforms, each with its ``RoadOption``."""
+    """Convert a route [R, 4] of x, y, z [m] and heading [rad] to the format of agents: positions
+    in degrees and as CARLA's transforms, each with its ``RoadOption``."""
     carla = importlib.import_module("carla")
     options = importlib.import_module("agents.navigation.local_planner").RoadOption
     names = {1: options.LEFT, 0: options.LANEFOLLOW, -1: options.RIGHT}
@@ -284,8 +285,8 @@ def command_of(control: Any, speed: float) -> Control:
 
     Throttle gives up to 4 m/s^2, decreasing towards 50 m/s. Rolling and air resistance are
     0.15 m/s^2 and 0.0006 times the squared speed while the vehicle moves. Brake gives up to
-    8 m/s^2, the hand brake all of it. Full steer is 70 degrees at the road wheels, less at higher
-    speed, and within the vehicle's limit.
+    8 m/s^2, and the hand brake always 8 m/s^2. Full steer is 70 degrees at the road wheels, less at
+    higher speed, and within the vehicle's limit.
 
     Raises:
         PeerError: not a command, or not finite.
@@ -356,7 +357,7 @@ def _views_in(obs: Observation) -> dict[str, PinholeView]:
 
 
 def _smaller(view: PinholeView, width: int) -> PinholeView:
-    """The same view with fewer pixels."""
+    """The view with fewer pixels."""
     shrunk = min(width / view.size[0], 1.0)
     size = max(round(view.size[0] * shrunk), 1), max(round(view.size[1] * shrunk), 1)
     K = np.diag([size[0] / view.size[0], size[1] / view.size[1], 1.0]) @ view.K

@@ -1,4 +1,4 @@
-"""Chooses among many short drives by the points that depth cameras show."""
+"""A planner that samples short drives and checks them against points from depth cameras."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from ..observation import Observation
 
 DT = 0.2
-"""Between the poses of a drive [s]."""
+"""Time between the poses of a drive [s]."""
 LANE_CHANGE = 12.0
 """Distance over which an offset is reached [m]."""
 REAR = 0.25
@@ -110,7 +110,7 @@ class DepthSampling:
         self._offset = 0.0
 
     def plan(self, obs: Observation) -> TrajectoryPlan:
-        """The best of the drives, in the vehicle frame of ``obs``."""
+        """The best drive, in the vehicle frame of ``obs``."""
         lattice, path, speed = self.lattice, Path.along(obs.route), max(obs.ego.speed, 0.0)
         limit = float(speed_limits(path, cruise=self.speed, comfort=self.comfort)[0])
         points = obstacle_points(obs, heights=lattice.heights, cell=lattice.cell)
@@ -131,7 +131,7 @@ class DepthSampling:
         )
 
     def _stop(self, speed: float, acceleration: float, limit: float) -> Array:
-        """[K, 2] metres travelled and speed while going on for a moment and then braking."""
+        """[K, 2] distance travelled [m] and speed [m/s] while reacting and then braking."""
         lattice = self.lattice
         on = np.arange(DT, lattice.reaction + 1e-9, DT)
         first = _profile(speed, acceleration, on, limit=limit)
@@ -143,7 +143,7 @@ class DepthSampling:
         return np.concatenate([first, held])
 
     def _hits(self, path: Path, stop: Array, points: Array, ego: EgoState) -> list[float | None]:
-        """By offset: speed [m/s] at which a point is first touched before the stop; or None."""
+        """By offset: speed [m/s] at the first contact with a point before the stop, or None."""
         if len(points) == 0:
             return [None] * len(self.lattice.offsets)
         poses = _poses(path, stop, self.lattice.offsets)
@@ -215,7 +215,7 @@ def _rotation(quaternion: tuple[float, float, float, float]) -> Array:
 
 
 def _profile(speed: float, acceleration: float, times: Array, *, limit: float) -> Array:
-    """[K, 2] metres travelled and speed [m/s] at ``times``; speed between 0 and ``limit``.
+    """[K, 2] distance travelled [m] and speed [m/s] at ``times``; speed is in 0 to ``limit``.
 
     Above the limit the drive brakes at least gently until the limit is reached.
     """
@@ -257,7 +257,7 @@ def _poses(path: Path, way: Array, offsets: Sequence[float]) -> Array:
 
 
 def _headings(path: Path) -> Array:
-    """[N] float64 of a path in the vehicle frame [rad]."""
+    """[N] float64 headings of a path in the vehicle frame [rad]."""
     if len(path.points) < 2:
         return np.zeros(len(path.points))
     along = np.gradient(path.points, path.arc, axis=0)
@@ -268,7 +268,7 @@ def _headings(path: Path) -> Array:
 def _inside(
     poses: Array, points: Array, size: tuple[float, float, float], margins: tuple[float, float]
 ) -> NDArray[np.bool_]:
-    """[O, K, P] whether points lie in the vehicle's box, grown by the margins, at each pose."""
+    """[O, K, P] whether each point is inside the vehicle's box, grown by the margins, per pose."""
     d = points - poses[:, :, None, :2]
     c, s = np.cos(poses[..., 2])[..., None], np.sin(poses[..., 2])[..., None]
     along, aside = c * d[..., 0] + s * d[..., 1], c * d[..., 1] - s * d[..., 0]

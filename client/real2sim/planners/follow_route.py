@@ -1,4 +1,4 @@
-"""Follows the route, slower in bends and behind others."""
+"""A planner that follows the route and slows down in bends and behind others."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.floating[Any]]
 
 WINDOW = np.ones(5) / 5
-"""Over which headings are smoothed, in points of a path."""
+"""Smoothing window of headings, in points of a path."""
 
 
 @dataclass(frozen=True)
@@ -138,7 +138,7 @@ class Path:
 
     @classmethod
     def along(cls, route: Array, *, spacing: float = 0.5) -> Path:
-        """The route [R, 2] from the vehicle on, resampled; a standing point where it is empty."""
+        """The route [R, 2] ahead of the vehicle, resampled; one point if the route is empty."""
         if len(route) == 0:
             return cls(np.zeros(1), np.zeros((1, 2)), np.zeros(2))
         route = _from_vehicle_on(route)
@@ -151,7 +151,7 @@ class Path:
         return cls(samples - start, points, -points[0])
 
     def curvature(self) -> Array:
-        """[N] float64, 1/m, unsigned; over about two metres, to be deaf to noise."""
+        """[N] float64 unsigned curvature [1/m], over about two metres to suppress noise."""
         if len(self.points) < 3:
             return np.zeros(len(self.points))
         slope = self._slope(self.points)
@@ -161,7 +161,7 @@ class Path:
         return np.abs(self._slope(smooth))
 
     def direction(self) -> Array:
-        """[N, 2] float64, unit vectors along the path; there have to be two points."""
+        """[N, 2] float64 unit vectors along the path; requires at least two points."""
         slope = self._slope(self.points)
         unit: Array = slope / np.maximum(_lengths(slope), 1e-9)[:, None]
         return unit
@@ -169,7 +169,7 @@ class Path:
     def poses(self, travelled: Array, recovery: float) -> Array:
         """[K, 3] x [m], y [m], yaw [rad] after the distances ``travelled`` [K]; the offset decays.
 
-        Yaw is the direction of the resulting path, so that a car can follow it.
+        Yaw is the direction of the resulting path, which a car can follow.
         """
         reach = 0.25
         both = self._at(np.concatenate([travelled, travelled + reach]), recovery)
@@ -210,12 +210,12 @@ class Profile:
     """A function along a path, evaluated at single points: linear between its samples."""
 
     def __init__(self, arc: Array, values: Array) -> None:
-        """The function with ``values`` [N] at increasing ``arc`` [N]; constant beyond both."""
+        """The function with ``values`` [N] at increasing ``arc`` [N]; constant beyond both ends."""
         self._arc: list[float] = arc.tolist()
         self._values: list[float] = values.tolist()
 
     def at(self, where: float) -> float:
-        """Its value there."""
+        """Value at one arc length."""
         arc, values = self._arc, self._values
         k = bisect_right(arc, where)
         if k == 0:
@@ -235,7 +235,7 @@ class Obstacle:
 
 
 def speed_limits(path: Path, *, cruise: float, comfort: Comfort) -> Array:
-    """[N] float64 m/s along the path: cruising, slower in bends, standing at its end."""
+    """[N] float64 speed limit along the path [m/s]: cruising, lower in bends, 0 at the end."""
     bend = np.sqrt(comfort.lateral / np.maximum(path.curvature(), 1e-6))
     limits = np.minimum(bend, cruise)
     to_end = path.arc[-1] - path.arc
@@ -244,8 +244,8 @@ def speed_limits(path: Path, *, cruise: float, comfort: Comfort) -> Array:
 
 
 def brake_ahead(arc: Array, limits: Array, *, braking: float) -> Array:
-    """Limits lowered so that each can be reached from the one before by braking."""
-    # Plain numbers: a running minimum of v^2 + 2 b s would lose digits where limits are small.
+    """Lower the limits until braking can reach each limit from the previous one."""
+    # A running minimum of v^2 + 2 b s would lose precision for small limits.
     places: list[float] = arc.tolist()
     lowered: list[float] = limits.tolist()
     for i in range(len(lowered) - 2, -1, -1):
@@ -285,7 +285,7 @@ def obstacles_on(
 
 
 def behind(obstacle: Obstacle, arc: Array, comfort: Comfort) -> Array:
-    """[N] float64 m/s at which one can still stop, or fall in, behind a obstacle."""
+    """[N] float64 maximum speed that allows stopping or following behind an obstacle [m/s]."""
     speed = max(obstacle.speed, 0.0)
     free = obstacle.arc - comfort.gap - comfort.headway * speed - arc
     limits: Array = np.sqrt(np.maximum(speed**2 + 2.0 * comfort.braking * free, 0.0))
@@ -295,7 +295,7 @@ def behind(obstacle: Obstacle, arc: Array, comfort: Comfort) -> Array:
 def drive_profile(
     arc: Array, limits: Array, *, speed: float, delays: Array, comfort: Comfort
 ) -> Array:
-    """[K] float64 metres travelled after each delay [s], from ``speed``, within limits.
+    """[K] float64 distance travelled after each delay [s], from ``speed``, within limits [m].
 
     Braking may exceed ``comfort.braking`` if an obstacle is already too near.
     """
@@ -353,25 +353,25 @@ def _in_vehicle_frame(ego: EgoState, agents: Sequence[AgentState]) -> tuple[Arra
 
 
 def _turned_back(vectors: Array, yaw: float) -> Array:
-    """Vectors [A, 2] of the world in axes that are turned by ``yaw`` [rad]."""
+    """Rotate world vectors [A, 2] into axes at heading ``yaw`` [rad]."""
     c, s = math.cos(yaw), math.sin(yaw)
     x, y = vectors[:, 0], vectors[:, 1]
     return np.stack([c * x + s * y, c * y - s * x], axis=1)
 
 
 def _interpolated(where: Array, arc: Array, points: Array) -> Array:
-    """[K, 2] of a polyline with points [N, 2] at arc lengths [N]; its ends beyond them."""
+    """[K, 2] points of a polyline with points [N, 2] at arc lengths [N], clamped to its ends."""
     return np.stack([np.interp(where, arc, points[:, k]) for k in (0, 1)], axis=1)
 
 
 def _lengths(vectors: Array) -> Array:
-    """[N] of vectors [N, 2]."""
+    """[N] lengths of vectors [N, 2]."""
     x, y = vectors[:, 0], vectors[:, 1]
     lengths: Array = np.sqrt(x * x + y * y)
     return lengths
 
 
 def _unwrapped(angles: Array) -> Array:
-    """Angles [N] without jumps of a full turn [rad]; unchanged if there are none."""
+    """Angles [N] without jumps of a full turn [rad]."""
     steps = np.abs(angles[1:] - angles[:-1])
     return np.unwrap(angles) if len(steps) and steps.max() > math.pi else angles

@@ -1,4 +1,4 @@
-"""Follows the route and the lead vehicle with the intelligent driver model."""
+"""A planner that follows the route and the lead vehicle with the intelligent driver model."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Follower:
     Attributes:
         acceleration: maximum acceleration, a.
         braking: comfortable deceleration, b.
-        hardest: limit of the deceleration.
+        hardest: maximum deceleration.
         headway: time gap to the lead vehicle, T [s].
         gap: bumper-to-bumper distance at standstill, s0 [m].
         clearance: free space required on either side of the vehicle [m].
@@ -50,7 +50,7 @@ class Follower:
     clearance: float = 0.3
 
     def answer(self, speed: float, desired: float, gap: float, closing: float) -> float:
-        """Acceleration [m/s^2] at ``gap`` metres behind an approached lead vehicle.
+        """Acceleration [m/s^2] at ``gap`` [m] behind a lead vehicle.
 
         ``a (1 - (v/v0)^4 - (s*/s)^2)`` with ``s* = s0 + v T + v dv / (2 sqrt(a b))``.
         """
@@ -121,7 +121,7 @@ class Idm:
         )
 
     def _drive(self, arc: Array, limits: Array, found: list[Obstacle], *, speed: float) -> Array:
-        """[K] float64 metres travelled after each delay."""
+        """[K] float64 distance travelled after each delay [m]."""
         leaders = [(one.arc, max(one.speed, 0.0)) for one in found]
         profile, position, now = Profile(arc, limits), 0.0, 0.0
         travelled: list[float] = []
@@ -142,7 +142,7 @@ class Idm:
         now: float,
         leaders: list[tuple[float, float]],
     ) -> float:
-        """The lowest answer to leaders, each with its place at the start and its speed."""
+        """The lowest acceleration over all leaders, each with its start position and speed."""
         answer = self.follower.answer
         rate = answer(speed, desired, math.inf, 0.0)
         for place, ahead in leaders:

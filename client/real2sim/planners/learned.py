@@ -1,6 +1,6 @@
 """A small network that drives with one camera, trained on recorded drives.
 
-``real2sim train-policy`` writes the file of weights. Requires torch and safetensors.
+``real2sim train-policy`` writes the weights file. Requires torch and safetensors.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ if TYPE_CHECKING:
 FORMAT = "real2sim-policy-1"
 COMMANDS = ("left", "straight", "right")
 SPEED_UNIT = 10.0
-"""The network is given the speed in this unit [m/s]."""
+"""Scale of the network's speed input [m/s]."""
 REACH = 20.0
-"""It answers positions in this unit [m]."""
+"""Scale of the network's output positions [m]."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class PolicyShape:
     spacing: float = 0.5
 
     def metadata(self) -> dict[str, str]:
-        """For the header of the file of weights."""
+        """Metadata for the header of a weights file."""
         return {"format": FORMAT, "shape": json.dumps(asdict(self))}
 
     @classmethod
@@ -83,7 +83,7 @@ class LearnedPolicy:
 
         Raises:
             ImportError: torch or safetensors is not installed.
-            ValueError: not such a file.
+            ValueError: the file has other content.
             OSError: it cannot be read.
         """
         torch, safetensors = _torch(), _module("safetensors")
@@ -100,7 +100,7 @@ class LearnedPolicy:
 
     @property
     def needs(self) -> Needs:
-        """Its camera."""
+        """The camera of the policy."""
         return Needs(modalities=("rgb",), cameras=(self.shape.camera,), width=2 * self.shape.width)
 
     def reset(self, obs: Observation) -> None:

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from ..observation import Observation
 
 SPACING_US = 500_000
-"""Between the points of an answer."""
+"""Time between the points of an answer."""
 COMMANDS = {"right": 0, "left": 1, "straight": 2}
 NUSCENES_CAMERAS = {
     "CAM_FRONT": 0.0,
@@ -52,14 +52,13 @@ NUSCENES_LIDAR = (
     (0.0, 0.0, 1.0, 1.84),
     (0.0, 0.0, 0.0, 1.0),
 )
-"""T_ego_lidar of nuScenes to a centimetre: x to the right, y forward. Networks count in it."""
+"""T_ego_lidar of nuScenes, rounded to a centimetre: x right, y forward. Planners use this frame."""
 
 
 class NeuroNcap:
     """A planner behind NeuroNCAP's interface.
 
-    Cameras with one of nuScenes' names keep it; others get the name with the most similar
-    direction.
+    Cameras with a nuScenes name keep it; others receive the name with the most similar direction.
     """
 
     needs = Needs(modalities=("rgb",), all_cameras=True)

@@ -41,7 +41,7 @@ def rgb_frames(obs: Observation) -> dict[str, Frame]:
     """The colour image of each camera, by its name.
 
     Raises:
-        PeerError: the observation shows none.
+        PeerError: the observation has no colour image.
     """
     frames = {name: found["rgb"] for name, found in obs.frames.items() if "rgb" in found}
     if not frames:
@@ -65,7 +65,7 @@ def headings(points: NDArray[np.floating[Any]], *, moved: float = 0.1) -> list[f
 
 
 def checked_points(answer: Any, *, columns: int, what: str) -> NDArray[np.float64]:
-    """Finite points [N, columns], N at least 1, out of an answer. Raises PeerError."""
+    """Parse finite points [N, columns], N at least 1, from an answer. Raises PeerError."""
     try:
         points = np.asarray(answer, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -82,8 +82,8 @@ def named_as(
 ) -> dict[str, str]:
     """Names that another simulator uses for the cameras.
 
-    Cameras that have one of these names keep it. Others get the free name with the nearest
-    direction, or none if all are taken.
+    Cameras that have one of these names keep it. Others receive the free name with the nearest
+    direction, or no name if all are taken.
 
     Args:
         frames: one frame per camera, by its name in the scene.
@@ -185,7 +185,7 @@ def _camera_for(
 
 
 def quoted_cameras(text: str) -> list[str]:
-    """Names of cameras that a refusal lists, as in ``cameras ['a', 'b'] are missing``."""
+    """Camera names listed in an error message such as ``cameras ['a', 'b'] are missing``."""
     lists: list[str] = re.findall(r"[Cc]ameras?\s*[\[({]([^\])}]*)", text)
     return list(dict.fromkeys(re.findall(r"['\"]([^'\"]+)['\"]", " ".join(lists))))
 

@@ -1,4 +1,4 @@
-"""Follows the route with two PID controllers; ignores other objects."""
+"""A planner that follows the route with two PID controllers and ignores other objects."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Gains:
-    """Gains of a PID controller for its error, the error's integral and derivative."""
+    """Gains of a PID controller: proportional, integral and derivative."""
 
     proportional: float
     integral: float = 0.0

@@ -1,4 +1,4 @@
-"""The planner's interface, the sensors it needs, finding one by name, and running an episode."""
+"""The planner interface, the sensors that planners need, loading by name, running episodes."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class Needs:
 
     Attributes:
         modalities: modalities of its cameras; empty if it uses no images.
-        cameras: camera names; empty: the camera that points most nearly straight ahead.
+        cameras: camera names; empty: the most forward-looking camera.
         all_cameras: whether it uses every camera of the scene instead.
         width: image width [px]; None: as recorded.
         privileged: whether observations list all objects.
@@ -110,8 +110,8 @@ def needs_of(planner: Planner) -> Needs:
 
 
 def forward_camera(cameras: Sequence[CameraInfo]) -> str:
-    """Name of the camera whose axis is nearest to the vehicle's x axis; the first of equals."""
-    # The optical axis is z of the camera frame, so its part along vehicle x is element [0, 2].
+    """Name of the camera whose axis is closest to the vehicle's x axis; the first in a tie."""
+    # The optical axis is z of the camera frame; its component along vehicle x is element [0, 2].
     return max(cameras, key=lambda camera: camera.T_vehicle_camera[0][2]).name
 
 
@@ -157,7 +157,7 @@ def load_planner(name: str) -> Planner:
 
 @dataclass(frozen=True)
 class StageTimes:
-    """Milliseconds that one stage took over an episode."""
+    """Statistics of the duration of one stage over an episode [ms]."""
 
     count: int
     mean: float
@@ -208,11 +208,11 @@ class EpisodeSummary:
 
     @property
     def steps_per_second(self) -> float:
-        """Rate of the whole loop."""
+        """Steps per second of the whole loop."""
         return self.steps / self.wall_seconds if self.wall_seconds > 0 else 0.0
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """The summary as JSON values."""
         fields = {k: v for k, v in vars(self).items() if k not in {"events", "stages"}}
         return fields | {
             "steps_per_second": self.steps_per_second,

@@ -88,7 +88,7 @@ class AlpasimRenderer:
         self._server: Any = None
 
     def start(self, address: str = "127.0.0.1:8080") -> int:
-        """Listen; the port. Raises PeerError where that is not possible."""
+        """Listen and return the port. Raises PeerError if that fails."""
         sizes = ("grpc.max_send_message_length", "grpc.max_receive_message_length")
         self._server = self._grpc.server(
             ThreadPoolExecutor(THREADS, thread_name_prefix="alpasim"),
@@ -217,7 +217,7 @@ class AlpasimRenderer:
             return refusal_of(error)
 
     def _images(self, requests: Sequence[Any]) -> list[bytes]:
-        """Images of the requests; those of one instant share a call to the worker."""
+        """Images of the requests; requests for the same instant share a call to the worker."""
         images: dict[int, bytes] = {}
         for members in _instants(requests).values():
             first = requests[members[0]]
@@ -340,7 +340,7 @@ def refusal_of(error: Exception) -> Refusal:
 
 
 def _cameras(scene: LinkedScene) -> dict[str, CameraInfo]:
-    """By name: the link's, AlpaSim's for cameras of similar direction, and the scene's own."""
+    """Cameras by name: the link's names, AlpaSim's for similar directions, and the scene's own."""
     own = {camera.name: camera for camera in scene.info.cameras}
     looks, given = looks_of(scene.info.cameras), scene.link.cameras
     named: dict[str, CameraInfo] = {}
@@ -356,7 +356,7 @@ def _cameras(scene: LinkedScene) -> dict[str, CameraInfo]:
 
 
 def _narrowed(camera: CameraInfo, name: str) -> CameraInfo:
-    """The camera with the field of view of AlpaSim's of that name, where its own is wider."""
+    """The camera, cropped to the field of view of AlpaSim's camera of that name if it is wider."""
     known = ALPASIM_CAMERAS.get(name)
     focal = camera.width / (2 * math.tan(known.field / 2)) if known else 0.0
     (fx, skew, _), (_, fy, _), last = camera.K
@@ -427,7 +427,7 @@ def _size(request: Any, native_width: int, native_height: int) -> tuple[int, int
 
 
 def _end_of(pair: Any, what: str) -> Matrix:
-    """The pose at the end of a frame, by which AlpaSim dates it."""
+    """The pose at the end of a frame, which is AlpaSim's timestamp of the frame."""
     pose = pair.end_pose if pair.HasField("end_pose") else pair.start_pose
     q, v = pose.quat, pose.vec
     quaternion = np.array([q.w, q.x, q.y, q.z], dtype=np.float64)

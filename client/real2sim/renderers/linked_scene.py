@@ -38,8 +38,8 @@ class SceneLink(BaseModel):
 
     Attributes:
         scene: name of the worker's scene.
-        T_world_theirs: from their world to the scene's; None: the scene's own metadata, else the
-            identity.
+        T_world_theirs: transform from their world to the scene's; None: from the scene's metadata,
+            else the identity.
         offset_us: their time minus the scene's [us].
         cameras: the scene's cameras by their names.
         objects: the scene's objects by their ids, in addition to the ids from the scene's log.
@@ -78,13 +78,13 @@ def read_links(path: Path) -> dict[str, SceneLink]:
 
 
 def frame_of(link: SceneLink, info: SceneInfo) -> Matrix:
-    """``T_world_theirs`` [4, 4]; readers of logs note where the world of their files is."""
+    """``T_world_theirs`` [4, 4], from the link or from the metadata that log readers write."""
     rows = link.T_world_theirs or info.provenance.get("T_world_dataset") or IDENTITY
     return np.array(rows, dtype=np.float64)
 
 
 def object_ids(link: SceneLink, info: SceneInfo) -> dict[str, str]:
-    """The scene's objects by their ids: the log's ids, and those of the link."""
+    """The scene's objects by their external ids: the ids of the log and of the link."""
     there = [found.object_id for found in info.objects]
     keys = info.provenance.get("track_ids")
     named = {str(key): name for name, key in _pairs(keys) if name in there}
@@ -165,9 +165,9 @@ class LinkedScene:
         """The frames of ``views``, in order, in as few requests as the worker allows.
 
         Args:
-            views: all of one time.
+            views: requested images, all at the same time.
             their_us: that time on their clock [us].
-            poses: [4, 4] of box centres in their world, by the scene's object ids.
+            poses: [4, 4] poses of box centres in their world, by the scene's object ids.
             others: as in ``client.scenes.view``.
 
         Raises:

@@ -83,13 +83,13 @@ class Answer:
 
 @dataclass(frozen=True)
 class ActorTrack:
-    """Where NeuroNCAP has an actor: times [N] [us], box centres ``T_world_object`` [N, 4, 4]."""
+    """An actor's motion in NeuroNCAP: times [N] [us], box centres ``T_world_object`` [N, 4, 4]."""
 
     times_us: list[int]
     poses: Matrix
 
     def at(self, t_us: int) -> Matrix | None:
-        """[4, 4], or None where the actor is not there at that time."""
+        """Pose [4, 4] at a time; None if the actor does not exist then."""
         after = int(np.searchsorted(self.times_us, t_us))
         if after == len(self.times_us) or (after == 0 and self.times_us[0] != t_us):
             return None
@@ -127,7 +127,7 @@ class NeuroNcapRenderer:
         self._server: ThreadingHTTPServer | None = None
 
     def start(self, host: str = "127.0.0.1", port: int = 8000) -> int:
-        """Listen; the port. Raises PeerError where that is not possible."""
+        """Listen and return the port. Raises PeerError if that fails."""
         try:
             self._server = ThreadingHTTPServer((host, port), _handler_of(self.answer))
         except OSError as error:

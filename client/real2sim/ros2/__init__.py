@@ -1,6 +1,6 @@
 """A ROS 2 bridge: a session on one side, topics on the other.
 
-``real2sim ros2`` runs it. :mod:`.messages` converts observations to messages, :mod:`.commands`
-converts messages to plans; both only use the names of ROS message types. :mod:`.bridge` is the
-loop, and :mod:`.node` is the only module that requires ``rclpy``.
+``real2sim ros2`` runs it. :mod:`.messages` converts observations to ROS messages and
+messages to plans; it does not import ROS. :mod:`.bridge` runs the loop, and its node is the only
+part that requires ``rclpy``.
 """

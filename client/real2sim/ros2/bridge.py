@@ -122,11 +122,11 @@ class Ros2Bridge:
         self._newest, self._is_fresh = message, True
 
     def _wait_for_plan(self, obs: Observation, due: float) -> Plan | None:
-        """The plan for an observation; None where ROS has ended."""
+        """The plan for an observation; None if ROS has ended."""
         self._is_fresh = self._is_fresh and self.real_time is not None
         while True:
             left = due - time.monotonic() if self.real_time else 0.2
-            # Also without remaining time: a simulation behind its clock must still receive
+            # Spin even without remaining time: a simulation that is late must still receive
             # commands.
             if not self.node.spin(min(max(left, 0.0), 0.2)):
                 return None
@@ -150,7 +150,7 @@ class Ros2Bridge:
             return None
 
     def _publish(self, builder: MessageBuilder, obs: Observation) -> None:
-        # The clock is published first, so that no other message is from the future.
+        # Publish the clock first: no other message may be from the future.
         publish = self.node.publish
         publish("/clock", "rosgraph_msgs/msg/Clock", builder.clock(obs.t_us))
         publish("/tf", "tf2_msgs/msg/TFMessage", builder.ego_transform(obs))
@@ -170,7 +170,7 @@ PACKAGES = ("rclpy", "sensor_msgs", "nav_msgs", "geometry_msgs", "tf2_msgs", "ro
 
 
 class NoRosError(Real2SimError):
-    """ROS 2 is not there."""
+    """ROS 2 is not installed."""
 
 
 class RosNode:

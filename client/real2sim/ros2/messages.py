@@ -91,7 +91,7 @@ class MessageBuilder:
         return self._transforms([(obs.t_us, MAP, BASE, ego.position, ego.quaternion)])
 
     def camera_transforms(self, t_us: int, cameras: Sequence[CameraInfo]) -> Any:
-        """tf2_msgs/TFMessage: every camera on ``base_link``; they do not move there."""
+        """tf2_msgs/TFMessage: the static pose of every camera in ``base_link``."""
         poses = [np.asarray(camera.T_vehicle_camera, np.float64) for camera in cameras]
         return self._transforms(
             [
@@ -190,7 +190,7 @@ def optical(camera: str) -> str:
 # Plans from ROS 2 messages. Members are read by name, so any message class works.
 
 SPEED_TIME = 0.3
-"""Within which a wanted speed is to be reached [s]."""
+"""Time within which the requested speed is reached [s]."""
 
 MAX_ACCELERATION, MAX_BRAKING = 4.0, 8.0
 """Limits for messages without an acceleration [m/s^2]."""
@@ -200,12 +200,12 @@ MIN_TURN_SPEED = 0.1
 
 
 class CommandError(Real2SimError):
-    """A message that is not a plan."""
+    """A message that cannot be converted to a plan."""
 
 
 def of_ackermann(message: Any, obs: Observation) -> Control:
-    """Of ackermann_msgs/AckermannDrive, also stamped: speed [m/s], below 0 backwards, steering
-    angle [rad], and acceleration [m/s^2] as a limit, 0 for as fast as possible."""
+    """Convert ackermann_msgs/AckermannDrive, also stamped: speed [m/s], negative for reverse,
+    steering angle [rad], and maximum acceleration [m/s^2], where 0 sets no limit."""
     drive = getattr(message, "drive", message)
     limit = abs(float(drive.acceleration))
     return _towards(float(drive.speed), float(drive.steering_angle), obs, limit=limit)

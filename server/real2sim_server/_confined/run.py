@@ -110,7 +110,7 @@ class _Starter:
         """Lines from child and starter: the outcome, if any, and the exit of the child.
 
         Raises:
-            ConfinedError: too long a request or answer, or no answer at all.
+            ConfinedError: the request or answer is too long, or there is no answer.
         """
         if len(request) > REQUEST_BYTES:
             raise ConfinedError(f"a request of {len(request)} bytes is too long")
@@ -135,7 +135,7 @@ class _Starter:
             try:
                 socket.send_fds(self._connected(), [request], [theirs.fileno()])
             except OSError:
-                # It has ended, by an operator's hand for example.
+                # The starter has ended; an operator may have killed it.
                 self._stop()
                 socket.send_fds(self._connected(), [request], [theirs.fileno()])
 
@@ -174,7 +174,7 @@ class _Starter:
 
 
 def _environment() -> dict[str, str]:
-    """Only the paths of the modules; a parser needs nothing more."""
+    """Environment of the child: only the module paths."""
     kept = {name: os.environ[name] for name in _KEPT_VARIABLES if name in os.environ}
     paths = [os.path.abspath(entry) for entry in sys.path]
     return kept | dict.fromkeys(_ONE_THREAD, "1") | {"PYTHONPATH": os.pathsep.join(paths)}

@@ -1,7 +1,7 @@
 """The starter process: forks a confined child for each request and reads no file.
 
-A program that has its modules loaded forks in milliseconds, where a new interpreter takes seconds.
-The starter has one thread and one socket to the process that began it, and ends with that one.
+A process with loaded modules forks in milliseconds; a new interpreter takes seconds to start. The
+starter has one thread and one socket to its parent process, and ends when the parent ends.
 """
 
 from __future__ import annotations
@@ -111,17 +111,17 @@ def _keep_capabilities(libc: ctypes.CDLL, kept: int) -> None:
 REQUEST_BYTES = 1 << 16
 OUT_OF_MEMORY = "out of memory"
 _MEMORY = ("allocate memory", "failed to map segment", "bad_alloc")
-"""Message fragments of libraries without an error type for a lack of memory."""
+"""Message fragments for a lack of memory, for libraries without an exception type for it."""
 
 
 @dataclass
 class _Child:
-    """A child at work.
+    """A running child.
 
     Attributes:
         answer: the caller's socket.
-        deadline: when it is ended, by the monotonic clock.
-        late: whether it was.
+        deadline: monotonic time at which the child is killed.
+        late: whether it was killed for that.
     """
 
     answer: int
@@ -130,7 +130,7 @@ class _Child:
 
 
 def main() -> None:
-    """Serve the socket that is standard input until it is closed."""
+    """Serve requests on standard input, a socket, until it is closed."""
     control = socket.socket(fileno=os.dup(0))
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     woken, wake = os.pipe()
@@ -194,7 +194,7 @@ def _serve(control: socket.socket, children: dict[int, _Child]) -> bool:
 
 
 def _load(name: str) -> None:
-    """Load a module of the program before the fork, so that children need no memory for it.
+    """Load a module of the program before the fork; children then share its memory.
 
     Late imports of its functions are listed in its ``LOADED_EARLY``.
     """
@@ -248,7 +248,7 @@ def _outcome(target: str, arguments: dict[str, Any]) -> dict[str, Any]:
 
 
 def _lacks_memory(error: BaseException | None) -> bool:
-    """Whether an error, or its cause, is a lack of memory. torch has no type for it."""
+    """Whether an error, or its cause, is a lack of memory. torch has no exception type for it."""
     while error is not None:
         if isinstance(error, MemoryError) or any(sign in str(error) for sign in _MEMORY):
             return True

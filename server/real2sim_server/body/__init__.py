@@ -1,8 +1,8 @@
 """People and bicycles as moving surfaces: a body model, linear blend skinning, gait and cycling.
 
-The frame of a body is that of an object on the ground: origin on the ground under the pelvis, x
-forward, y left, z up, metres. Joint rotations follow SMPL-like models: zero is the rest pose, and
-each rotates the parts below its joint, about the axes of the body's frame.
+The body frame has its origin on the ground under the pelvis: x forward, y left, z up, metres. Joint
+rotations follow SMPL-like models: zero is the rest pose, and each rotation moves all parts below
+its joint, about the axes of the body frame.
 """
 
 from .model import (

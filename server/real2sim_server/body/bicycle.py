@@ -1,4 +1,4 @@
-"""A bicycle and its rider: wheels and cranks turn by the distance covered, limbs reach them."""
+"""A bicycle and its rider: wheels and cranks turn with the distance, and the limbs follow."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ SURFACES = ("bicycle_frame", "tyre", "rim", "crank", "saddle")
 
 _RIGID, _REAR, _FRONT, _CRANKS, _PEDAL_L, _PEDAL_R = range(6)
 GEAR = 2.4
-"""Turns of the wheels for one of the cranks."""
+"""Turns of the wheels per turn of the cranks."""
 
-# Measures of an adult's city bicycle, (x, z) from the ground under its middle [m].
+# Dimensions of an adult's city bicycle, (x, z) from the ground under its middle [m].
 REAR_AXLE, FRONT_AXLE = (-0.51, 0.34), (0.54, 0.34)
 BOTTOM, HEAD_LOW, HEAD_HIGH, STEM = (-0.08, 0.29), (0.36, 0.72), (0.31, 0.88), (0.28, 1.0)
 GRIP = (0.2, 0.28, 1.03)
 WHEEL_RADIUS, CRANK_LENGTH, PEDAL_OFFSET = 0.34, 0.165, 0.125
 SEAT_X = -0.27
 ADULT_LEG = 0.87
-"""Leg length of whom those measures fit [m]."""
+"""Leg length of a rider whom these dimensions fit [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +36,7 @@ class Bicycle:
     """A bicycle that fits its rider.
 
     Attributes:
-        scale: of all measures.
+        scale: factor on all dimensions.
         saddle: height of the saddle's top [m].
         vertices: [V, 3] with the left crank forward, frame with the origin on the ground under
             the middle, x forward, z up [m].
@@ -54,7 +54,7 @@ class Bicycle:
 
     @property
     def wheel_radius(self) -> float:
-        """[m]."""
+        """Radius of the wheels [m]."""
         return WHEEL_RADIUS * self.scale
 
     def crank_angle(self, distance: ArrayLike) -> Float:
@@ -97,8 +97,8 @@ class Ride:
 
     Attributes:
         body: the rider.
-        bicycle: of the rider.
-        times: [N] of the path [s].
+        bicycle: the rider's bicycle.
+        times: [N] times of the path [s].
         distance: [N] covered since its start [m].
         roll: [N] lean to the left [rad].
     """
@@ -134,7 +134,7 @@ class Ride:
 
     @cached_property
     def seat(self) -> Seat:
-        """How the rider sits."""
+        """The rider's seat on the bicycle."""
         return seat_rider(self.body)
 
 
@@ -144,7 +144,7 @@ def plan_ride(body: Body, times: ArrayLike, positions: ArrayLike, yaws: ArrayLik
     Leaning into a bend balances the centrifugal force: tan(roll) = v yaw' / g.
 
     Raises:
-        ValueError: times that do not rise.
+        ValueError: times that do not increase.
     """
     times = np.asarray(times, dtype=np.float64)
     positions = np.asarray(positions, dtype=np.float64)
@@ -163,7 +163,7 @@ def plan_ride(body: Body, times: ArrayLike, positions: ArrayLike, yaws: ArrayLik
 
 @dataclass(frozen=True, eq=False)
 class Seat:
-    """How a rider sits: the pelvis's place [3], leans of pelvis and chest [rad], the saddle [m]."""
+    """Seat of a rider: pelvis position [3], lean of pelvis and chest [rad], saddle height [m]."""
 
     body: Body
     scale: float
@@ -219,8 +219,8 @@ class Seat:
 
 
 def seat_rider(body: Body) -> Seat:
-    """Sit a body on the bicycle that fits it: legs almost straight below, hands on the grips."""
-    # Frames for tall riders are barely longer; their saddle is higher.
+    """Seat a body on a fitting bicycle: legs almost straight at the bottom, hands on the grips."""
+    # Frames for tall riders are only slightly longer, but the saddle is higher.
     scale = min(body.leg_length / ADULT_LEG, 1.02)
     pelvis_lean = np.radians(12)
     trial = Seat(body, scale, np.array([SEAT_X * scale, 0, 1.0]), pelvis_lean, 0.0, 0.0)
@@ -267,13 +267,13 @@ def _point(xz: tuple[float, float], y: float = 0.0) -> Float:
 
 
 def _crankset(scale: float) -> Bicycle:
-    """A bicycle with only the drivetrain."""
+    """A bicycle with only its drivetrain."""
     none = np.zeros(0, np.int64)
     return Bicycle(scale, 0.0, np.zeros((0, 3)), none.reshape(0, 3), none, none)
 
 
 def build_bicycle(scale: float, saddle: float) -> Bicycle:
-    """A bicycle of measures scaled by ``scale``, its saddle's top at ``saddle`` [m]."""
+    """A bicycle with dimensions scaled by ``scale`` and the saddle's top at ``saddle`` [m]."""
     parts = _Parts()
     seat = (BOTTOM[0] + (SEAT_X - BOTTOM[0]) * 0.8, 0.72)
     top = (SEAT_X - 0.01, saddle / scale)
@@ -363,7 +363,7 @@ class _Parts:
             self.tube([near, axle + (WHEEL_RADIUS - 0.05) * out], 0.0018, RIM, moves, sides=3)
 
     def build(self, scale: float, saddle: float) -> Bicycle:
-        """All of it, scaled."""
+        """The whole bicycle, scaled."""
         return Bicycle(
             scale,
             saddle,

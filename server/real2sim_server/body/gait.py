@@ -1,17 +1,17 @@
 """Walking and running along a path, driven by the distance covered.
 
-Footsteps are placed along the path first: every foot rests at one position on the ground from heel
-strike to toe-off, and the legs are bent so that they reach their feet. So no foot slides, at any
-speed, on any path. Stride lengths follow from speed and leg length, for walking and running alike:
+Footsteps are placed along the path first. Every foot stays at one position on the ground from heel
+strike to toe-off, and the legs bend to reach the feet. Feet therefore never slide, at any speed and
+on any path. Stride length depends on speed and leg length, for walking and running alike:
 
     stride = 2.3 (v^2 / (g h))^0.3 h
 
-Alexander, "Estimates of speeds of dinosaurs", Nature 261, 1976, for mammals; walking people take
-strides a tenth longer (113 steps a minute at 1.4 m/s: Perry and Burnfield, below). The Froude
-number v^2 / (g h) also determines when people walk and when they run (about 0.5; Alexander,
-"Optimization and gaits in the locomotion of vertebrates", Physiological Reviews 69, 1989). Angles
-of the trunk and the arms in walking are those of Perry and Burnfield, "Gait analysis", 2010,
-rounded.
+The formula is from Alexander, "Estimates of speeds of dinosaurs", Nature 261, 1976, for mammals.
+The strides of walking people are 10 % longer (113 steps per minute at 1.4 m/s: Perry and Burnfield,
+below). The Froude number v^2 / (g h) determines the transition from walking to running (at about
+0.5; Alexander, "Optimization and gaits in the locomotion of vertebrates", Physiological Reviews 69,
+1989). Angles of the trunk and the arms in walking are rounded from Perry and Burnfield, "Gait
+analysis", 2010.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ GRAVITY = 9.81
 WALK_TO_RUN = (0.4, 0.8)
 """Froude numbers between which walking blends into running."""
 TURN_RADIUS = 0.25
-"""Turning on the spot makes steps as going round a circle of this radius would [m]."""
+"""Turning on the spot takes as many steps as walking a circle of this radius [m]."""
 STANDING = 0.04
 """Below this speed a person stands still [m/s]."""
 LEAD = 3.0
@@ -75,7 +75,8 @@ class Footsteps:
     Attributes:
         lift, land: [K] step counts along the walk at which it leaves a position and reaches the
             next.
-        spots: [K + 1, 3] of the middle of its hip's track, on the ground, world frame [m].
+        spots: [K + 1, 3] middle of its hip's track at each position, on the ground, world frame
+            [m].
         yaws: [K + 1] direction of the foot [rad].
     """
 
@@ -90,8 +91,8 @@ class Gait:
     """Motion of a body along a path.
 
     Attributes:
-        body, style: of the person.
-        times: [N] of the path [s].
+        body, style: the person's body and walking style.
+        times: [N] times of the path [s].
         path: [N, 4] x, y, z on the ground and yaw, world frame.
         steps: [N] number of steps so far; each whole number is one swing of a foot.
         speeds: [N], smoothed [m/s].
@@ -107,7 +108,7 @@ class Gait:
     feet: tuple[Footsteps, Footsteps]
 
     def at(self, times: ArrayLike) -> tuple[Float, Float]:
-        """Places x, y, z, yaw [T, 4] on the path and steps made [T] at times [T] [s]."""
+        """Poses x, y, z, yaw [T, 4] on the path and step counts [T] at times [T] [s]."""
         times = np.atleast_1d(np.asarray(times, dtype=np.float64))
         place = np.stack([np.interp(times, self.times, self.path[:, i]) for i in range(4)], -1)
         return place, np.interp(times, self.times, self.steps)
@@ -121,14 +122,15 @@ class Gait:
 
 
 def stride_length(speed: ArrayLike, leg_length: float) -> Float:
-    """Stride length of a body with hips at ``leg_length`` [m] at speeds [m/s]; see the module."""
+    """Stride length [m] at speeds [m/s] for hips at height ``leg_length`` [m]; see the module."""
     froude = np.asarray(speed, dtype=np.float64) ** 2 / (GRAVITY * leg_length)
     human = 1.1 - 0.1 * running_share(speed, leg_length)
     return human * 2.3 * froude**0.3 * leg_length
 
 
 def duty_factor(speed: ArrayLike, leg_length: float) -> Float:
-    """Share of a stride that a foot is on the ground: .7 in slow walking, .36 in running."""
+    """Fraction of a stride during which a foot is on the ground: 0.7 in slow walking, 0.36 in
+    running."""
     froude = np.asarray(speed, dtype=np.float64) ** 2 / (GRAVITY * leg_length)
     running = running_share(speed, leg_length)
     walking = 0.70 - 0.10 * np.clip(np.sqrt(froude) / 0.6, 0.0, 1.0)
@@ -151,9 +153,9 @@ def plan_gait(
     """Place footsteps along a path.
 
     Args:
-        body: of the person.
+        body: body of the person.
         times: [N] increasing [s].
-        positions: [N, 3] of the body's origin on the ground, world frame [m].
+        positions: [N, 3] positions of the body's origin on the ground, world frame [m].
         yaws: [N], direction that the body faces [rad].
         style: walking style.
 
@@ -186,7 +188,7 @@ def _checked(times: ArrayLike, positions: ArrayLike, yaws: ArrayLike) -> tuple[F
 
 
 def _extended(times: Float, path: Float) -> tuple[Float, Float]:
-    """The path at even steps, straight on for a while at both ends."""
+    """The path resampled evenly and extended straight at both ends."""
     if len(times) == 1:
         times, path = times[0] + np.array([0.0, _STEP]), np.repeat(path, 2, axis=0)
     ends = []
@@ -197,7 +199,7 @@ def _extended(times: Float, path: Float) -> tuple[Float, Float]:
     times = np.concatenate([[ends[0][0]], times, [ends[1][0]]])
     path = np.concatenate([[ends[0][1]], path, [ends[1][1]]])
     fine = np.linspace(times[0], times[-1], max(round((times[-1] - times[0]) / _STEP), 2) + 1)
-    # Two instants that only rounding tells apart would have no speed between them.
+    # Instants that differ only by rounding would give no valid speed.
     apart = np.abs(fine[:, None] - times[np.searchsorted(times, fine)[:, None] - [0, 1]]).min(
         axis=1
     )
@@ -211,7 +213,7 @@ def _path_speed(times: Float, path: Float) -> Float:
 
 
 def _smoothed(speed: Float) -> Float:
-    """Means over .3 s: paths from recordings jump in speed."""
+    """Moving average over 0.3 s, because recorded paths have jumps in speed."""
     half = round(0.15 / _STEP)
     total = np.concatenate([[0.0], np.cumsum(np.pad(speed, half, mode="edge"))])
     return (total[2 * half + 1 :] - total[: -2 * half - 1]) / (2 * half + 1)  # type: ignore[no-any-return]
@@ -220,9 +222,9 @@ def _smoothed(speed: Float) -> Float:
 def _count_steps(
     times: Float, speed: Float, leg: float, style: GaitStyle
 ) -> tuple[Float, list[tuple[int, int]]]:
-    """Step counts [N], and the first and the last step of each segment between two stops.
+    """Step counts [N], and the first and last step of each segment between two stops.
 
-    Segments have whole numbers of steps, so strides are slightly adjusted.
+    Each segment has a whole number of steps, so stride lengths are slightly adjusted.
     """
     going = speed > STANDING
     length = 0.5 * style.stride * stride_length(np.maximum(speed, STANDING), leg)
@@ -248,7 +250,7 @@ def _lay_footsteps(  # noqa: PLR0917 - all that a step depends on
     speed: Float,
     ways: list[tuple[int, int]],
 ) -> tuple[Footsteps, Footsteps]:
-    """Footsteps of both feet; step ``n`` is the left foot's where ``n + phase`` is even."""
+    """Footsteps of both feet; the left foot makes step ``n`` if ``n + phase`` is even."""
     rising = np.concatenate([[True], np.diff(steps) > 0])
     known, where = steps[rising], path[rising]
     feet = []
@@ -279,7 +281,7 @@ def _place(known: Float, where: Float, step: float) -> Float:
 
 
 def _apart(lift: list[float], land: list[float]) -> tuple[list[float], list[float]]:
-    """A foot stays briefly at each position, at any speed."""
+    """Keep a foot at each position for a minimum time, at any speed."""
     for k in range(1, len(lift)):
         if lift[k] < land[k - 1] + 0.2:
             middle = (lift[k] + land[k - 1]) / 2
@@ -288,7 +290,7 @@ def _apart(lift: list[float], land: list[float]) -> tuple[list[float], list[floa
 
 
 class _Motion:
-    """A gait at some instants: places [T, 4], steps [T], speeds [T]."""
+    """A gait at T instants: poses [T, 4], step counts [T], speeds [T]."""
 
     def __init__(self, gait: Gait, place: Float, steps: Float, speed: Float, times: Float) -> None:
         self.gait, self.body, self.style = gait, gait.body, gait.style
@@ -352,7 +354,7 @@ class _Motion:
         start, end = self._yaw(walk, spot, side), self._yaw(walk, spot + 1, side)
         away = foot.standing(self._spot(walk, spot, side), start, off)
         down = foot.standing(self._spot(walk, spot + 1, side), end, strike)
-        # A foot that has to overtake a running body must not dwell where it was.
+        # In running, a foot must overtake the body and cannot stay at its old position.
         linear = 0.35 + 0.4 * self.running
         ankle = away + (smooth(p) + linear * (p - smooth(p)))[:, None] * (down - away)
         ankle[:, 2] += self._lift_height(size, p)
@@ -361,7 +363,7 @@ class _Motion:
         return ankle, start + smooth(p) * (end - start), pitch, toes
 
     def _sizes(self, walk: Footsteps) -> Float:
-        """Lengths of a foot's swings against the leg's [K]."""
+        """[K] lengths of a foot's swings, relative to the leg length."""
         return np.linalg.norm(np.diff(walk.spots, axis=0), axis=1) / self.body.leg_length  # type: ignore[no-any-return]
 
     def _off_angle(self, size: Float) -> Float:
@@ -407,7 +409,7 @@ class _Motion:
         return about(UP, yaw) @ about(LATERAL, lean) @ about([1, 0, 0], list_)
 
     def _pelvis_place(self, turned: Float, feet: list[tuple[Float, Float, Float]]) -> Float:
-        """As high as both legs allow, with soft transitions."""
+        """The maximum height that both legs allow, with smooth transitions."""
         body, leg = self.body, self.body.leg_length
         sway = -0.02 * leg * self.effort * np.sin(self.turn) * (1 - 0.5 * self.running)
         idle = 0.006 * leg * (1 - self.effort)
@@ -451,9 +453,9 @@ class Foot:
     """A foot in the rest pose.
 
     Attributes:
-        ankle, ball: joints [3].
-        heel: [3] its rearmost point on the ground.
-        yaw: its direction [rad].
+        ankle, ball: [3] joints.
+        heel: [3] rearmost point on the ground.
+        yaw: direction [rad].
     """
 
     def __init__(self, body: Body, side: str) -> None:
@@ -466,7 +468,7 @@ class Foot:
         self.heel = np.array([*back[:, :2].mean(axis=0), 0.0])
 
     def standing(self, spots: Float, yaw: Float, pitch: Float) -> Float:
-        """Ankles [T, 3] over spots, rolled over the heel (pitch < 0) or the ball (pitch > 0)."""
+        """Ankles [T, 3] above spots, rolled over the heel (pitch < 0) or the ball (pitch > 0)."""
         flat = about(UP, yaw - self.yaw)
         rolled = self.turned(yaw, pitch)
         pivot = np.where((pitch > 0)[:, None], self.ball, self.heel)
@@ -489,11 +491,11 @@ def leg_lengths(body: Body, side: str) -> tuple[float, float]:
 def put_leg(  # noqa: PLR0917 - hip, ankle and foot are one leg
     body: Body, local: Float, side: str, hip: Float, ankle: Float, foot: Float
 ) -> None:
-    """Rotate thigh, calf and foot in rotations ``local`` [T, J, 3, 3], whose pelvis is set.
+    """Set the rotations of thigh, calf and foot in ``local``; the pelvis must be set.
 
     Args:
-        body: with the leg.
-        local: rotations, written.
+        body: body with the leg.
+        local: [T, J, 3, 3] rotations, modified in place.
         side: "l" or "r".
         hip, ankle: joints [T, 3] in the body frame.
         foot: [T, 3, 3] rotation of the foot in the body frame.
@@ -513,7 +515,7 @@ def put_leg(  # noqa: PLR0917 - hip, ankle and foot are one leg
 
 
 def put_spine(local: Float, pelvis: Float, chest: Float, head: Float) -> None:
-    """Spread the turn from pelvis to chest over the spine, and from chest to head over the neck."""
+    """Distribute the pelvis-to-chest rotation over the spine, and chest-to-head over the neck."""
     part = partial_turn(np.swapaxes(pelvis, -1, -2) @ chest, 1 / 3)
     for name in ("spine_1", "spine_2", "spine_3"):
         local[:, JOINTS.index(name)] = part
@@ -528,12 +530,12 @@ def put_arm(  # noqa: PLR0917 - the angles of one arm
     """Pose an arm.
 
     Args:
-        body: with the arm.
-        local: [T, J, 3, 3] rotations, written.
+        body: body with the arm.
+        local: [T, J, 3, 3] rotations, modified in place.
         side: "l" or "r".
-        shoulder: [T] swing forward of the upper arm against the chest [rad].
+        shoulder: [T] forward swing of the upper arm relative to the chest [rad].
         elbow: [T] bend [rad].
-        out: of the arm from the side [rad].
+        out: angle of the arm from the side [rad].
     """
     sign = 1.0 if side == "l" else -1.0
     out = np.broadcast_to(np.asarray(out, dtype=np.float64), shoulder.shape)

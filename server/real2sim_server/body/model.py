@@ -1,4 +1,4 @@
-"""The body model: a mesh with joints and a linear basis of shapes, forward kinematics, skinning."""
+"""The body model: a mesh with joints, a linear shape basis, forward kinematics and skinning."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from .._numba import kernel
 from ..geometry import Float, quaternion_to_matrix
 
-# Its data, ``asset.npz``, come from MakeHuman (CC0); see ``ASSET.md``.
+# The data in ``asset.npz`` are from MakeHuman (CC0); see ``ASSET.md``.
 
 _SIDED = ("clavicle", "upper_arm", "forearm", "hand", "thigh", "calf", "foot", "ball")
 
@@ -22,7 +22,7 @@ JOINTS = (
     *("pelvis", "spine_1", "spine_2", "spine_3", "neck", "head"),
     *(f"{name}_{side}" for side in "lr" for name in _SIDED),
 )
-"""Names of the joints, each after the one it hangs on."""
+"""Names of the joints, each after its parent."""
 
 KEYPOINTS = (
     *("nose", "left_eye", "right_eye", "left_ear", "right_ear"),
@@ -36,7 +36,7 @@ KEYPOINT_JOINTS = tuple(
     for name in ("upper_arm", "forearm", "hand", "thigh", "calf", "foot")
     for side in "lr"
 )
-"""Joints that are the keypoints from the sixth on."""
+"""Joints used for the sixth and later keypoints."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,17 +46,17 @@ class BodyModel:
     Attributes:
         vertices: [V, 3] mean shape in the rest pose, body frame [m].
         joints: [J, 3] joints of the mean shape [m].
-        basis: [K, V + J, 3] change of vertices and joints per unit of a shape coefficient, which is
-            a standard deviation of the source builds [m].
+        basis: [K, V + J, 3] change of vertices and joints per unit of a shape coefficient; one unit
+            is a standard deviation of the source builds [m].
         builds: shape coefficients [K] of named builds.
         parents: [J] parent joint, -1 for the pelvis.
-        weight_joints, weights: [V, 4] joints that move a vertex, and their weights; sums are one.
-        triangles: [T, 3] vertices, anticlockwise seen from outside.
+        weight_joints, weights: [V, 4] joints that move a vertex, and their weights, which sum to 1.
+        triangles: [T, 3] vertices, counter-clockwise as seen from outside.
         triangle_groups: [T] index into ``group_names``.
-        group_names: of the triangles that are always present ("body"), and of optional ones:
-            "long_hair", "skirt".
+        group_names: names of the triangles that are always present ("body") and of the optional
+            ones ("long_hair", "skirt").
         parts: [V] index into ``part_names``.
-        part_names: of the parts of a body.
+        part_names: names of the body parts.
         mirror: [V] vertex on the other side.
         face: [5] vertices that are COCO's nose, eyes and ears.
     """
@@ -81,7 +81,7 @@ class BodyModel:
 
         Args:
             shape: [<= K] coefficients, or the name of a build (``builds``).
-            height: of the body [m]; scales it as a whole.
+            height: height of the body [m]; scales it uniformly.
 
         Raises:
             ValueError: an unknown build, too many or invalid coefficients, a height outside
@@ -99,7 +99,7 @@ class BodyModel:
         return Body(self, coefficients, vertices, joints, tall)
 
     def triangles_of(self, groups: Sequence[str]) -> NDArray[np.int64]:
-        """Indices of the triangles of the body and of further groups.
+        """Indices of the triangles of the body and of other groups.
 
         Raises:
             ValueError: an unknown group.
@@ -128,11 +128,11 @@ class Body:
     """A body in its rest pose.
 
     Attributes:
-        model: that it is a shape of.
+        model: the body model.
         shape: [<= K] coefficients.
         vertices: [V, 3], body frame [m].
         joints: [J, 3] [m].
-        height: from the ground to the top of the head [m].
+        height: height from the ground to the top of the head [m].
     """
 
     model: BodyModel
@@ -242,12 +242,12 @@ def rest_pose(body: Body) -> Pose:
 
 
 def joint_transforms(body: Body, pose: Pose) -> Float:
-    """``[..., J, 3, 4]`` that take points of the rest pose to where each joint carries them."""
+    """``[..., J, 3, 4]`` transforms of the joints from the rest pose to this pose."""
     return chain_transforms(body, quaternion_to_matrix(pose.rotations), pose.pelvis)
 
 
 def chain_transforms(body: Body, rotations: Float, pelvis: Float) -> Float:
-    """As :func:`joint_transforms`, of matrices [..., J, 3, 3]."""
+    """Like :func:`joint_transforms`, for rotation matrices [..., J, 3, 3]."""
     turned = np.empty_like(rotations)
     places = np.empty(rotations.shape[:-1])
     for joint, parent in enumerate(body.model.parents):
@@ -263,20 +263,20 @@ def chain_transforms(body: Body, rotations: Float, pelvis: Float) -> Float:
 
 
 def joint_positions(body: Body, transforms: Float) -> Float:
-    """Joints [..., J, 3] of transforms [..., J, 3, 4]."""
+    """Joints [..., J, 3] moved by transforms [..., J, 3, 4], body frame [m]."""
     turned: Float = (transforms[..., :3] @ body.joints[:, :, None])[..., 0]
     return turned + transforms[..., 3]
 
 
 def skin(body: Body, transforms: Float) -> Float:
-    """Vertices [..., V, 3] of transforms [..., J, 3, 4], body frame [m]."""
+    """Vertices [..., V, 3] skinned by transforms [..., J, 3, 4], body frame [m]."""
     many = np.ascontiguousarray(transforms, dtype=np.float64).reshape(-1, len(body.joints), 3, 4)
     out: Float = skin_vertices(body.vertices, body.model.weight_joints, body.model.weights, many)
     return out.reshape(*transforms.shape[:-3], -1, 3)
 
 
 def skin_reference(body: Body, transforms: Float) -> Float:
-    """The plain twin of :func:`skin`."""
+    """NumPy reference implementation of :func:`skin`."""
     chosen = transforms[..., body.model.weight_joints, :, :]
     blended: Float = (chosen * body.model.weights[:, :, None, None]).sum(axis=-3)
     turned: Float = (blended[..., :3] @ body.vertices[:, :, None])[..., 0]
@@ -291,7 +291,7 @@ def keypoints(body: Body, vertices: Float, transforms: Float) -> Float:
 
 
 def vertex_normals(vertices: Float, triangles: NDArray[np.int64]) -> Float:
-    """Unit normals [V, 3] of vertices [V, 3], means of their triangles' by area."""
+    """Unit normals [V, 3] of vertices [V, 3]: area-weighted means of their triangles' normals."""
     out: Float = mesh_normals(np.ascontiguousarray(vertices), triangles)
     return out
 
@@ -319,7 +319,7 @@ def about(axis: ArrayLike, angle: ArrayLike) -> Float:
 
 
 def aim(start: ArrayLike, end: Float) -> Float:
-    """The shortest rotations [T, 3, 3] that take directions [3] or [T, 3] to directions [T, 3]."""
+    """The shortest rotations [T, 3, 3] from directions [3] or [T, 3] to directions [T, 3]."""
     a, b = np.broadcast_arrays(unit(np.asarray(start, dtype=np.float64)), unit(end))
     v, c = np.cross(a, b), (a * b).sum(axis=-1)
     cross = np.zeros((*v.shape[:-1], 3, 3))
@@ -332,14 +332,14 @@ def aim(start: ArrayLike, end: Float) -> Float:
 
 
 def frame(along: Float, lateral: Float) -> Float:
-    """Right-handed frames [..., 3, 3], columns: along, lateral made square to it, the third."""
+    """Right-handed frames [..., 3, 3] with columns: along, lateral orthogonalised, their normal."""
     along = unit(along)
     square = unit(lateral - (lateral * along).sum(axis=-1, keepdims=True) * along)
     return np.stack([along, square, np.cross(along, square)], axis=-1)
 
 
 def partial_turn(rotations: Float, fraction: float) -> Float:
-    """The rotations [T, 3, 3] by a fraction of their angles, about their own axes."""
+    """The rotations [T, 3, 3] with their angles scaled by a fraction, about the same axes."""
     trace = np.trace(rotations, axis1=-2, axis2=-1)
     angle = np.arccos(np.clip((trace - 1) / 2, -1, 1))
     skew = (rotations - np.swapaxes(rotations, -1, -2)) / 2
@@ -353,7 +353,7 @@ def bend(start: Float, end: Float, upper: float, lower: float, towards: Float) -
     """Position of the middle joint [T, 3] of two bones.
 
     Args:
-        start, end: of the limb [T, 3]; an end out of reach gives a straight limb.
+        start, end: [T, 3] ends of the limb; an end out of reach gives a straight limb.
         upper, lower: lengths of its bones [m].
         towards: [T, 3], direction of the middle joint.
     """

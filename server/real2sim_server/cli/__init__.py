@@ -1,7 +1,7 @@
 """The server's part of the ``real2sim`` command.
 
-Every ``real2sim --help`` imports this package, so its modules load nothing heavy: a command imports
-what it needs when it runs.
+``real2sim --help`` imports this package, so its modules must load fast. Each command imports its
+dependencies when it runs.
 """
 
 from . import doctor, drive, export, logs, physics, policies, reconstruct, scene, serve, store

@@ -291,7 +291,7 @@ def _inspected(findings: dict[str, str]) -> _Report:
     # Only useful if CUDA is expected: torch is built for it, or a driver is loaded.
     wanted = torch.version.cuda is not None or Path("/proc/driver/nvidia/version").is_file()
     needs = [*cuda_needs(), *compiler_needs()] if wanted else []
-    # Report requirements shared by both GPU backends once.
+    # Requirements shared by both GPU backends are reported once.
     told = {"cuda", "nvrtc"} if needs else {"nvrtc"}
     mend = {f"{b.name}: {b.remedy}" for b in described if b.remedy and b.name not in told}
     return _Report(

@@ -187,7 +187,7 @@ def _with_speed(board: Storyboard, speed: float) -> Storyboard:
 
 
 def _scene(bundle: Path | None, board: Storyboard, road_file: Path | None, made: Path) -> Scene:
-    """The scene to drive in; a flat one is first written to ``made``, so that it has a hash."""
+    """The scene to drive in; a flat scene is first written to ``made`` to give it a hash."""
     from ..maps import MapError
     from ..scenarios import ScenarioError
     from ..scenarios.flat_scene import flat_scene
@@ -355,7 +355,7 @@ def _load_its_scene(recording: Recording, path: Path) -> Scene:
 def _replay_factory(
     recording: Recording, scene: Scene, assets: Path | None
 ) -> Callable[[], Replayer]:
-    """A factory of the session as it was before its first entry."""
+    """A factory of the session in its state before the first entry."""
     from ..edit import EditError
     from ..service.library.assets import AssetLibrary
     from ..world.recording import RecordingError

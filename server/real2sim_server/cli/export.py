@@ -78,7 +78,7 @@ def import_(
     overwrite: Overwrite = False,
     json: JsonFile = None,
 ) -> None:
-    """Turn a splat file or a checkpoint of another system into a scene, or splats into an asset."""
+    """Convert a splat file or checkpoint of another system to a scene, or splats to an asset."""
     refuse_existing(out, overwrite=overwrite)
     if file.suffix == CHECKPOINT_SUFFIX:
         figures = _import_checkpoint(file, out, dataset, frames, overwrite=overwrite)

@@ -1,7 +1,7 @@
-"""``real2sim doctor --gpu-check``: checks and measurements for a new GPU, in some minutes.
+"""``real2sim doctor --gpu-check``: checks and measurements for a new GPU; takes a few minutes.
 
-Parts run independently and report their own errors, so one call shows as much as possible.
-Comparisons use the CPU backends of the same machine.
+The parts run independently and report their own errors. Comparisons use the CPU backends of the
+same machine.
 """
 
 from __future__ import annotations
@@ -148,7 +148,7 @@ class GpuCheck:
 
     @property
     def right(self) -> bool:
-        """Whether every part ran and all comparisons agree, whatever the speed."""
+        """Whether every part ran and all comparisons agree, regardless of speed."""
         compared = (f.holds for f in self.findings if f.part in ("pictures", "lidar", "training"))
         return not self.failed and False not in compared
 

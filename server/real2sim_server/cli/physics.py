@@ -145,7 +145,7 @@ def simulate(
 
 
 def values_of(given: list[str]) -> dict[str, PhysicsValues]:
-    """Values of ``--physics`` by object; "*" stands for all objects."""
+    """Values of ``--physics`` by object; "*" means all objects."""
     from pydantic import ValidationError
 
     from real2sim_proto.operations import PhysicsValues

@@ -82,7 +82,7 @@ def reconstruct(
     overwrite: Overwrite = False,
     json: JsonFile = None,
 ) -> None:
-    """Turn a driving log into a scene of Gaussians."""
+    """Reconstruct a Gaussian scene from a driving log."""
     from ..logs import inspect_log, open_log, select_from_log
     from ..reconstruct import InitialiseOptions, ReconstructOptions, reconstruct
     from ..reconstruct.training.schedule import at_width
@@ -289,7 +289,7 @@ def _lidar_figures(score: LidarScore) -> dict[str, object]:
 # --- fit-lidar, fit-uncertainty -------------------------------------------------------------------
 
 Fitted = tuple["Scene", dict[str, Any]]
-"""The fitted scene, and figures of the fit."""
+"""The fitted scene, and the fit's figures."""
 
 
 @dataclass(frozen=True)

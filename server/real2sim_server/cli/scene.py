@@ -62,7 +62,7 @@ def render(
     device: RenderDevice = None,
     json: JsonFile = None,
 ) -> None:
-    """Draw one logged camera of a scene; with --log print PSNR against the recorded image.
+    """Render one recorded camera of a scene; with --log, print PSNR against the recorded image.
 
     With --lidar, cast a sweep of a LiDAR on the recording vehicle instead, and draw it next to the
     image.
@@ -326,7 +326,7 @@ def _plane_figures(planes: dict[str, RoadPlane]) -> dict[str, object]:
 
 
 def _height_figures(scene: Scene, t_us: int, sources: dict[str, Float]) -> dict[str, object]:
-    """Height differences under the boxes: ground fitted to each source against the scene's."""
+    """Height differences below the boxes between each source's ground and the scene's ground."""
     import numpy as np
 
     from ..scene.ground_fit import DrivenPath, box_bottoms, fit_ground

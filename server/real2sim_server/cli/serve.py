@@ -81,7 +81,7 @@ def serve(
 
 
 def _check_variables() -> None:
-    """Reject misspelt settings, which would have no effect; warn about other unknown ones.
+    """Reject misspelt settings and warn about other unknown ones.
 
     Raises:
         CommandError: names the variable and the most similar setting.

@@ -231,7 +231,7 @@ def add(
         highlight=False,
         soft_wrap=True,
     )
-    # Print only the token to stdout, so that it can be piped.
+    # Print only the token to stdout, to allow piping.
     print(token)
 
 

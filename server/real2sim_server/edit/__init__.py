@@ -1,4 +1,4 @@
-"""Edits: typed operations onto objects, and scenarios as append-only logs of them."""
+"""Edits: typed operations on objects, and scenarios as append-only logs of operations."""
 
 from .appearance import vacated_parking
 from .apply import EditOutcome, apply_operations, replay_operations

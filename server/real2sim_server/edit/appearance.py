@@ -29,7 +29,7 @@ tracks of stationary objects vary by some decimetres.
 """
 
 AWAY = 0.5
-"""An object this far from its parking place uncovers the ground there [m]."""
+"""An object at least this far from its parked position uncovers the ground there [m]."""
 
 MARGIN = 0.25
 """Colours reach this far beyond a box [m]."""
@@ -42,8 +42,8 @@ LOW = 0.25
 
 MIN_POINTS = 6
 NEIGHBOURS = 48
-"""Number of neighbours for the median colour, so that neither a line nor a shadow next to the box
-is extended under it.
+"""Number of neighbours for the median colour; large enough to ignore lines and shadows next to the
+box.
 """
 
 
@@ -51,7 +51,7 @@ def vacated_parking(state: ScenarioState, poses: Mapping[str, Float]) -> tuple[s
     """Ids of recorded objects that were parked and are no longer in place.
 
     Args:
-        state: with the recorded objects.
+        state: state with the recorded objects.
         poses: ``T_world_object`` [4, 4] of all existing objects, by id, after edits and impacts.
     """
     return tuple(
@@ -61,7 +61,7 @@ def vacated_parking(state: ScenarioState, poses: Mapping[str, Float]) -> tuple[s
         and (
             _away(poses[recorded.object_id], recorded)
             if recorded.object_id in poses
-            # What is unedited and not there was not recorded at that time.
+            # An unedited object without a pose was not recorded at that time.
             else state.objects[recorded.object_id] is not recorded
         )
     )
@@ -111,7 +111,7 @@ def _away(pose: Float, parked: ObjectState) -> bool:
 
 
 def _recolour(sh: Tensor, places: Tensor, unknown: Tensor, known: Tensor) -> None:
-    """Give those of ``unknown`` [N] bool the median ``sh`` of the nearest ``known``, in place."""
+    """Set ``sh`` of the ``unknown`` [N] bool to the median of their nearest ``known``, in place."""
     count = min(NEIGHBOURS, int(known.sum()))
     if count < MIN_POINTS or not bool(unknown.any()):
         return
@@ -122,8 +122,8 @@ def _recolour(sh: Tensor, places: Tensor, unknown: Tensor, known: Tensor) -> Non
 
 # --- Contact shadows -----------------------------------------------------------------------------
 
-# Recorded objects have theirs in the background. Edited ones share one cloud of flat dark
-# Gaussians, stretched to the footprint of each.
+# Shadows of recorded objects are part of the background. Edited objects share one cloud of flat
+# dark Gaussians, scaled to each footprint.
 
 SHADOW_MARGIN = 0.35
 """The shadow reaches this far beyond the footprint [m], fading."""
@@ -154,10 +154,10 @@ def contact_shadow(
     """The shadow of a box; None if the box is too far above the ground.
 
     Args:
-        T_world_object: [4, 4] float64, of the box centre.
+        T_world_object: [4, 4] float64 pose of the box centre.
         size: (length, width, height) [m].
-        ground: below it.
-        device: of the shadow's Gaussians.
+        ground: ground below the box.
+        device: device of the shadow's Gaussians.
     """
     bottom = bottom_centres(T_world_object[None], size)[0]
     height = ground.height(float(bottom[0]), float(bottom[1]))
@@ -174,7 +174,7 @@ def contact_shadow(
 
 @cache
 def _decal(level: int, device: str) -> GaussianCloud:
-    """A unit square of flat Gaussians, darkest in the middle, nothing at the rim."""
+    """A unit square of flat Gaussians, darkest in the middle and invisible at the rim."""
     columns, rows = CELLS
     x, y = np.meshgrid(
         (np.arange(columns) + 0.5) / columns - 0.5,
@@ -203,19 +203,19 @@ def _decal(level: int, device: str) -> GaussianCloud:
 Colour = tuple[float, float, float]
 
 AROUND = 20.0
-"""Background this far around the ego's path gives the ambient light [m]."""
+"""Distance around the ego's path in which the background gives the ambient light [m]."""
 
 HEIGHTS = (-2.0, 6.0)
-"""And this far below and above it: the street, not the tree tops [m]."""
+"""The same below and above the path, to include the street but not the tree tops [m]."""
 
 GAIN_RANGE = (0.5, 2.0)
-"""Limits of colour factors; beyond them, the estimate is more likely wrong than the asset."""
+"""Limits of colour factors; larger corrections are more likely to be errors of the estimate."""
 
 LUMA = (0.2126, 0.7152, 0.0722)
 
 
 def ambient_colour(scene: Scene) -> Colour:
-    """Mean colour of the street around the ego's path, each Gaussian by the area it shows."""
+    """Mean colour of the street around the ego's path, weighted by the Gaussians' visible area."""
     cloud = scene.background
     path = torch.from_numpy(scene.ego.positions).to(cloud.means)
     low, high = path.min(dim=0).values, path.max(dim=0).values
@@ -247,9 +247,9 @@ def relighting_gain(scene: Scene, cloud: GaussianCloud, ambient: Colour | None) 
     Otherwise the brightness is matched to the scene's own objects; the tint does not change.
 
     Args:
-        scene: target of the asset.
-        cloud: of the asset.
-        ambient: of the asset's source, see :func:`ambient_colour`.
+        scene: scene that receives the asset.
+        cloud: Gaussians of the asset.
+        ambient: ambient colour of the asset's source, see :func:`ambient_colour`.
     """
     if ambient is not None:
         here = ambient_colour(scene)
@@ -265,12 +265,12 @@ def relighting_gain(scene: Scene, cloud: GaussianCloud, ambient: Colour | None) 
 
 
 def relit(cloud: GaussianCloud, gain: Colour) -> GaussianCloud:
-    """The cloud with its colours multiplied by ``gain``; itself if that is 1."""
+    """The cloud with its colours multiplied by ``gain``; the same object if ``gain`` is 1."""
     if gain == (1.0, 1.0, 1.0):
         return cloud
     factors: Tensor = torch.tensor(gain).to(cloud.sh)
     sh = cloud.sh * factors
-    # The renderer adds 0.5 to the harmonics; that part must be multiplied too.
+    # The renderer adds 0.5 to the harmonics; this constant must be multiplied too.
     sh[:, 0] += (factors - 1.0) * 0.5 / SH_C0
     return replace(cloud, sh=sh)
 

@@ -30,11 +30,11 @@ OFF_GROUND = 0.3
 """A box bottom this much higher or lower above ground than in the recording is reported [m]."""
 
 OUTSIDE_MAP = 100.0
-"""An object this far outside the rectangle that the recording reached is reported [m]."""
+"""An object this far outside the bounding rectangle of the recording is reported [m]."""
 
 SLIP, SLIP_STEPS, MOVING = np.radians(20), 5, 1.0
-"""An object is reported if it slides this far off its heading [rad] for this many samples more than
-in the recording; slower objects [m/s] count as stationary.
+"""An object is reported if its motion deviates by more than this angle from its heading [rad] for
+this many samples more than in the recording. Slower objects [m/s] count as stationary.
 """
 
 NAMED_OVERLAPS = 5
@@ -53,7 +53,7 @@ def validate_edit(state: ScenarioState, touched: Sequence[str]) -> Iterator[Edit
     Very long trajectories are checked at 201 evenly spread times.
 
     Args:
-        state: after the edit.
+        state: state after the edit.
         touched: ids that the edit named or created; deleted ones are skipped.
     """
     subjects = [state.objects[i] for i in touched if not state.objects[i].deleted]
@@ -70,14 +70,13 @@ def validate_edit(state: ScenarioState, touched: Sequence[str]) -> Iterator[Edit
 def _sampled(trajectory: Trajectory, start_us: int, end_us: int) -> _Samples:
     """The trajectory at the sample times of that range, cached for the trajectory's lifetime.
 
-    A cache of fixed size would drop every entry just before its use, once a scenario has one object
-    more than entries.
+    A cache of fixed size would miss every lookup once a scenario has more objects than entries.
     """
     by_range = _samples.setdefault(trajectory, {})
     found = by_range.get((start_us, end_us))
     if found is None:
         while len(by_range) >= REMEMBERED_RANGES:
-            # Scenarios share trajectories, and are edited on several threads.
+            # Scenarios share trajectories and may be edited on several threads.
             by_range.pop(next(iter(by_range), (0, 0)), None)
         found = by_range[start_us, end_us] = sample(trajectory, _sample_times(start_us, end_us))
     return found
@@ -113,7 +112,7 @@ def _overlaps(
 def _first_overlap(
     subject: ObjectState, other: ObjectState, times: NDArray[np.int64], own: Float
 ) -> int:
-    """Index of the first of ``times`` with overlapping boxes; their number if there is none."""
+    """Index of the first time at which the boxes overlap; ``len(times)`` if they never do."""
     theirs, covered = _sampled(other.trajectory, int(times[0]), int(times[-1]))
     found: int = first_overlap(
         (own, theirs),
@@ -126,7 +125,7 @@ def _first_overlap(
 
 
 def _within_reach(subject: ObjectState, state: ScenarioState, own: Float) -> Iterator[ObjectState]:
-    """Visible objects with a bounding box of the path close to that of ``subject``."""
+    """Visible objects whose path's bounding box is close to that of ``subject``."""
     others = [o for o in state.objects.values() if not o.deleted and o is not subject]
     if not others:
         return
@@ -225,7 +224,7 @@ class EditOutcome:
     """Result of a batch of operations.
 
     Attributes:
-        state: after all operations.
+        state: state after all operations.
         created: ids of new objects, regions and colliders, in order.
         inverse: operations that revert the batch when applied in this order. Numbers are restored
             up to rounding; `Scenario.undo` restores the exact state.
@@ -267,7 +266,7 @@ def apply_operations(state: ScenarioState, operations: Sequence[Operation]) -> E
 
 
 def replay_operations(state: ScenarioState, operations: Sequence[Operation]) -> ScenarioState:
-    """The state of :func:`apply_operations` alone, for replaying a log. Raises like it."""
+    """Only the state of :func:`apply_operations`, for replaying a log; raises the same errors."""
     for index, operation in enumerate(operations):
         state = _apply_one(state, operation, index).state
     return state
@@ -285,7 +284,7 @@ def _apply_one(state: ScenarioState, operation: Operation, index: int) -> Applie
 
 
 def _check_number(state: ScenarioState, operation: Operation, index: int) -> None:
-    """Only for new edits: an existing log beyond the limit is replayed unchanged."""
+    """Check the limit for new edits; existing logs beyond the limit are still replayed."""
     if len(state.objects) <= MAX_OBJECTS:
         return
     if sum(not found.deleted for found in state.objects.values()) > MAX_OBJECTS:

@@ -1,4 +1,4 @@
-"""From a scenario state to the instances for the renderer and the targets of LiDARs."""
+"""Converts a scenario state to instances for the renderer and targets for LiDARs."""
 
 from __future__ import annotations
 
@@ -39,11 +39,12 @@ its colours as well if parked objects were moved.
 
 
 def instances_at(scene: Scene, state: ScenarioState, t_us: int) -> list[Instance]:
-    """Background first, then every visible object that exists at ``t_us``, then soft shadows under
-    objects placed by edits; only time-dependent parts are computed.
+    """The background, every visible object at ``t_us``, and contact shadows, in this order.
+
+    Objects placed by edits get contact shadows. Parts that do not depend on time are cached.
 
     Args:
-        scene: with the Gaussians; ``state`` must be made from it.
+        scene: scene with the Gaussians; ``state`` must be made from it.
         state: objects, poses and scales.
         t_us: time [us].
 
@@ -61,10 +62,10 @@ def compose(
     *,
     strides: Mapping[str, Stride] = NO_STRIDES,
 ) -> list[Instance]:
-    """The same for objects that are already ``placed``.
+    """Like :func:`instances_at`, for objects that are already ``placed``.
 
-    People walk by their ``strides`` by id, or otherwise by their trajectories. Raises like
-    :func:`instances_at`.
+    People walk by their ``strides`` (by id), or otherwise by their trajectories. Raises the same
+    errors.
     """
     poses = {o.object_id: T for o, T in zip(placed.objects, placed.transforms, strict=True)}
     instances = [Instance(composed_background(scene, state, poses))]
@@ -98,8 +99,8 @@ def instances_of(
 
 
 def instances_at_start(scene: Scene, state: ScenarioState) -> list[Instance]:
-    """Everything that a scenario renders at its start or later, except shadows: the background and
-    every visible object, at any pose. Raises like :func:`instances_of`.
+    """All instances that a scenario may render from its start on, except shadows: the background
+    and every visible object, at any pose. Raises like :func:`instances_of`.
     """
     placed = state.tracks.at(scene.start_us)
     poses = {o.object_id: T for o, T in zip(placed.objects, placed.transforms, strict=True)}
@@ -127,8 +128,10 @@ def _standing(
 def contact_shadows(
     scene: Scene, placed: Iterable[tuple[ObjectState, Float]], t_us: int
 ) -> list[Instance]:
-    """Soft shadows under the objects (each with its ``T_world_object``) that are not where the
-    recording, and so their shadow in the background, has them at ``t_us``."""
+    """Contact shadows of objects, given with their ``T_world_object``.
+
+    Objects at their recorded pose at ``t_us`` are omitted: their shadow is in the background.
+    """
     shadows = [
         contact_shadow(transform, subject.scaled_size, scene.ground, device=scene.background.device)
         for subject, transform in placed
@@ -140,8 +143,9 @@ def contact_shadows(
 def cloud_of(
     scene: Scene, subject: ObjectState, t_us: int, *, stride: Stride | None = None
 ) -> GaussianCloud:
-    """The Gaussians of an object at ``t_us``, before its own scale, in its own frame; for a person,
-    in the walking state ``stride``, or otherwise of the trajectory.
+    """The Gaussians of an object at ``t_us``, in the object's frame, before its scale is applied.
+
+    A person walks by ``stride``, or otherwise by the trajectory.
 
     Raises:
         UnknownObjectError: ``subject`` is of another scene.
@@ -165,7 +169,7 @@ def _posed(scene: Scene, subject: ObjectState, t_us: int, stride: Stride | None)
 
 
 def figure_of(scene: Scene, subject: ObjectState) -> Figure | None:
-    """The figure of a walking person with edits applied; None for other objects.
+    """The figure of a walking person, with edits applied; None for other objects.
 
     Raises:
         UnknownObjectError: ``subject`` is of another scene.
@@ -180,8 +184,10 @@ def figure_of(scene: Scene, subject: ObjectState) -> Figure | None:
 def composed_background(
     scene: Scene, state: ScenarioState, poses: Mapping[str, Float]
 ) -> GaussianCloud:
-    """The background without the Gaussians in erased regions, and with plain ground in place of
-    parked objects that ``poses`` (``T_world_object`` [4, 4] by id) have moved; the rest is shared.
+    """The background without erased regions, with inpainted ground where parked objects were.
+
+    ``poses`` are ``T_world_object`` [4, 4] by id; parked objects that they move uncover the ground.
+    All other tensors are shared.
     """
     erased, left = state.erased, vacated_parking(state, poses)
     if not erased and not left:
@@ -195,7 +201,7 @@ def composed_background(
 
 
 def without_regions(background: GaussianCloud, erased: tuple[EraseRegion, ...]) -> GaussianCloud:
-    """The background with the Gaussians with centres in ``erased`` made invisible."""
+    """The background with all Gaussians invisible whose centres are in ``erased``."""
     opacities = background.opacities.clone()
     for region in erased:
         T_region_world = invert_transform(
@@ -283,14 +289,14 @@ def _shown(subject: ObjectState, others: Others) -> bool:
 
 # --- LiDAR sweeps --------------------------------------------------------------------------------
 
-# Objects where edits put them, moving over the sweep.
+# Objects at their edited poses, moving during the sweep.
 
 
 def sweep_of(scene: Scene, state: ScenarioState, lidar: Lidar, t_us: int) -> SweepScene:
     """Targets of ``lidar`` in a scenario during the sweep about ``t_us`` [us].
 
-    Every visible object that exists then, with its edits applied, and with its surfaces for LiDARs
-    if the scene has them; the background without erased regions.
+    Contains the background without erased regions, and every visible object that exists then, with
+    its edits, and with fitted LiDAR surfaces if the scene has them.
 
     Raises:
         UnknownObjectError: ``state`` is of another scene.
@@ -307,7 +313,7 @@ def sweep_of(scene: Scene, state: ScenarioState, lidar: Lidar, t_us: int) -> Swe
 
 
 def background_target(scene: Scene, state: ScenarioState) -> tuple[Instance, Attributes | None]:
-    """The background as rays hit it, without erased regions, and its attributes."""
+    """Geometry of the background for ray casting, without erased regions, and its attributes."""
     cloud, attributes = lidar_target(scene, None)
     if state.erased:
         cloud = kept(scene, ("lidar", state.erased), lambda: without_regions(cloud, state.erased))
@@ -317,9 +323,9 @@ def background_target(scene: Scene, state: ScenarioState) -> tuple[Instance, Att
 def object_target(
     scene: Scene, subject: ObjectState, transform: Float, t_us: int, *, stride: Stride | None = None
 ) -> tuple[Instance, Attributes | None]:
-    """An object at ``transform`` as rays hit it, and its attributes.
+    """Geometry of an object at ``transform`` for ray casting, and its attributes.
 
-    It takes its pose of ``t_us``, or for a person the phase of the gait that ``stride`` gives.
+    A walking person has the gait phase of ``stride``, or otherwise of ``t_us``.
     """
     cloud, attributes = _object_cloud(scene, subject, t_us, stride)
     semantic = semantic_class(subject.category)
@@ -351,7 +357,7 @@ ROW = np.dtype(
 """A point in the world [m]; its normal is the thinnest axis of its Gaussian."""
 
 MIN_OPACITY = 0.1
-"""Fainter Gaussians are omitted."""
+"""Minimum opacity of exported Gaussians."""
 
 _TYPES = {"<f4": "float", "|u1": "uchar", "<u2": "ushort"}
 
@@ -365,16 +371,17 @@ def points_at(
     instance_id: int | None = None,
     least_opacity: float = MIN_OPACITY,
 ) -> NDArray[np.void]:
-    """Rows of ROW of a scenario at a time.
+    """Points of a scenario at a time, as an array of dtype ROW.
 
-    Normals point towards the recorded path, those of objects away from their centre.
+    Normals of the background point towards the recorded path, normals of objects away from the
+    object's centre.
 
     Args:
-        scene: of the scenario.
+        scene: scene of the scenario.
         state: the scenario.
         t_us: time [us].
-        part: of the scene.
-        instance_id: of a single object; None for all.
+        part: part of the scene.
+        instance_id: id of a single object; None for all.
         least_opacity: minimum opacity of a Gaussian.
 
     Raises:
@@ -431,7 +438,7 @@ def _rows(scene: Scene, instance: Instance, least_opacity: float) -> NDArray[np.
 
 
 def _nearest(path: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The place on a path, raised to where sensors look from, that is nearest to each point."""
+    """The nearest point of a path, raised to the height of the sensors, for each point."""
     from scipy.spatial import cKDTree
 
     raised = path + np.array([0.0, 0.0, 1.6])

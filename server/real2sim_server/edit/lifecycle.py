@@ -48,7 +48,7 @@ from .state import AssetSource, EditError, ObjectState, ScenarioState
 
 @object_operation(Duplicate)
 def duplicate(state: ScenarioState, subject: ObjectState, operation: Duplicate) -> AppliedOperation:
-    """Add a copy, shifted."""
+    """Add a shifted copy of an object."""
     _require_free_instance_id(state)
     shift = (operation.x, operation.y, operation.z)
     trajectory = shifted(subject.trajectory, shift, operation.frame)
@@ -95,7 +95,7 @@ def insert(state: ScenarioState, operation: Insert) -> AppliedOperation:
 
 @operation(Spawn)
 def spawn(state: ScenarioState, operation: Spawn) -> AppliedOperation:
-    """Add a moving road user; its initial track goes straight on."""
+    """Add a moving road user; its initial trajectory is straight."""
     _require_free_instance_id(state)
     appearance = _appearance(state, operation)
     if operation.pose is None:
@@ -126,7 +126,7 @@ def spawn(state: ScenarioState, operation: Spawn) -> AppliedOperation:
 def replace_appearance(
     state: ScenarioState, subject: ObjectState, operation: Replace
 ) -> AppliedOperation:
-    """Replace the appearance in the box; the centre of its bottom stays in place."""
+    """Replace the appearance of an object; the centre of its box's bottom stays in place."""
     appearance = _appearance(state, operation)
     box = operation.size or subject.scaled_size
     factors = _fitting(box, appearance.size)
@@ -154,7 +154,7 @@ def replace_appearance(
 
 @operation(Delete)
 def delete(state: ScenarioState, operation: Delete) -> AppliedOperation:
-    """Leave a tombstone."""
+    """Delete an object, region or collider; a tombstone reserves its id."""
     target, inverse = operation.object_id, Restore(object_id=operation.object_id)
     if target in state.regions or target in state.colliders:
         if target in state.tombstones:
@@ -165,7 +165,7 @@ def delete(state: ScenarioState, operation: Delete) -> AppliedOperation:
 
 @operation(Restore)
 def restore(state: ScenarioState, operation: Restore) -> AppliedOperation:
-    """Take a tombstone away."""
+    """Restore a deleted object, region or collider."""
     target, inverse = operation.object_id, Delete(object_id=operation.object_id)
     if target in state.tombstones:
         return AppliedOperation(replace(state, tombstones=state.tombstones - {target}), inverse)
@@ -239,14 +239,14 @@ def _fitting(
 # --- Physics, background and clock ---------------------------------------------------------------
 
 PEOPLE = frozenset({"pedestrian", "person"})
-"""Categories of scenes' objects that may be walking bodies."""
+"""Categories of scene objects that may be walking people."""
 
 
 @object_operation(SetPhysics)
 def set_physics(
     state: ScenarioState, subject: ObjectState, operation: SetPhysics
 ) -> AppliedOperation:
-    """Set physical properties of an object; defaults for omitted ones."""
+    """Set physical properties of an object; omitted ones return to their defaults."""
     inverse = subject.physics or SetPhysics(object_id=subject.object_id)
     return object_changed(
         state,
@@ -259,7 +259,7 @@ def set_physics(
 def set_velocity(
     state: ScenarioState, subject: ObjectState, operation: SetVelocity
 ) -> AppliedOperation:
-    """Say how fast an object enters the physics."""
+    """Set the initial velocity of an object in the physics."""
     inverse = subject.velocity or SetVelocity(object_id=subject.object_id)
     return object_changed(
         state,
@@ -270,7 +270,7 @@ def set_velocity(
 
 @object_operation(SetGait)
 def set_gait(state: ScenarioState, subject: ObjectState, operation: SetGait) -> AppliedOperation:
-    """Say how a person walks."""
+    """Set the gait of a walking person."""
     walks = subject.asset.figure is not None if subject.asset else subject.category in PEOPLE
     if not walks:
         raise invalid_operation(

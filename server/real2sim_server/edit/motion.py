@@ -1,4 +1,4 @@
-"""Edit operations: how each is applied, and those on where objects are and when."""
+"""The registry of edit operations, and the operations on poses, sizes and trajectories."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from .tracks import sample_poses
 
 # --- Registry ------------------------------------------------------------------------------------
 
-# Each operation is registered for its model of the wire.
+# Each operation is registered for its wire model.
 
 MAX_ID_LENGTH = 80
 
@@ -46,10 +46,10 @@ class AppliedOperation:
     """Result of one operation.
 
     Attributes:
-        state: after it.
-        inverse: reverts it.
-        touched: id of the object for review; None if there is none.
-        created: id of the new object; None if there is none.
+        state: state after the operation.
+        inverse: operation that reverts it.
+        touched: id of the object to review, or None.
+        created: id of the new object, or None.
     """
 
     state: ScenarioState
@@ -65,11 +65,11 @@ ApplyToObject = Callable[[ScenarioState, ObjectState, Any], AppliedOperation]
 """``apply(state, subject, operation)``, for the object that ``operation.object_id`` names."""
 
 APPLY: dict[type[Any], Apply] = {}
-"""By the model of the wire, see :mod:`real2sim_proto.operations`."""
+"""Functions by wire model, see :mod:`real2sim_proto.operations`."""
 
 
 def operation(model: type[Any]) -> Callable[[Apply], Apply]:
-    """Register how operations of a model are applied."""
+    """Register the function that applies operations of a model."""
 
     def register(apply: Apply) -> Apply:
         APPLY[model] = apply
@@ -81,7 +81,7 @@ def operation(model: type[Any]) -> Callable[[Apply], Apply]:
 def object_operation(model: type[Any]) -> Callable[[ApplyToObject], ApplyToObject]:
     """Register the function that applies operations of a model to their object.
 
-    The object exists and is not deleted; otherwise the operation raises as :func:`require_object`.
+    If the object does not exist or is deleted, the operation raises like :func:`require_object`.
     """
 
     def register(apply: ApplyToObject) -> ApplyToObject:
@@ -95,24 +95,24 @@ def object_operation(model: type[Any]) -> Callable[[ApplyToObject], ApplyToObjec
 
 
 def apply_operation(state: ScenarioState, operation: Operation) -> AppliedOperation:
-    """The state after one operation. Raises EditError or SceneError as the operation does."""
+    """The state after one operation. Raises EditError or SceneError if it is impossible."""
     return APPLY[type(operation)](state, operation)
 
 
 def object_changed(
     state: ScenarioState, subject: ObjectState, inverse: Operation
 ) -> AppliedOperation:
-    """The change that puts ``subject`` in the place of the object of its id."""
+    """The change that replaces the object with the same id by ``subject``."""
     return AppliedOperation(state.with_object(subject), inverse, touched=subject.object_id)
 
 
 def invalid_operation(message: str, *, hint: str | None = None) -> EditError:
-    """An INVALID_OPERATION."""
+    """An EditError with code INVALID_OPERATION."""
     return EditError(ErrorCode.INVALID_OPERATION, message, hint=hint)
 
 
 def require_object(state: ScenarioState, object_id: str) -> ObjectState:
-    """The object of that id. Raises EditError: UNKNOWN_OBJECT, or INVALID_OPERATION if deleted."""
+    """The object with an id. Raises EditError: UNKNOWN_OBJECT, or INVALID_OPERATION if deleted."""
     found = state.objects.get(object_id)
     if found is None:
         known = ", ".join(o.object_id for o in state.visible) or "none"
@@ -130,10 +130,10 @@ def require_object(state: ScenarioState, object_id: str) -> ObjectState:
 
 
 def new_id(state: ScenarioState, wanted: str | None, stem: str) -> str:
-    """The id ``wanted``, or the first free one of ``stem`` with a number.
+    """The id ``wanted``, or the first free id made of ``stem`` and a number.
 
     Raises:
-        EditError: INVALID_OPERATION when it is taken, or would be too long.
+        EditError: INVALID_OPERATION if the id is taken or too long.
     """
     if wanted is not None:
         if state.has_id(wanted):
@@ -158,7 +158,7 @@ def new_id(state: ScenarioState, wanted: str | None, stem: str) -> str:
 
 
 def wire_track(trajectory: Trajectory) -> Track:
-    """A trajectory as operations carry it."""
+    """Convert a trajectory to its wire model."""
     return Track(
         times_us=trajectory.times_us.tolist(),
         positions=trajectory.positions.tolist(),
@@ -167,7 +167,7 @@ def wire_track(trajectory: Trajectory) -> Track:
 
 
 def trajectory_of(track: Track) -> Trajectory:
-    """The trajectory an operation carries. Raises SceneError when it is none."""
+    """Convert the wire model of a trajectory. Raises SceneError if it is invalid."""
     return Trajectory(
         np.array(track.times_us, dtype=np.int64),
         np.array(track.positions, dtype=np.float64),
@@ -181,7 +181,7 @@ MAX_COORDINATE = 1e6
 MAX_TIME_US = 2**62
 
 SCALE_RANGE = (1e-3, 1e3)
-"""All scalings of an object together stay within this, along each axis."""
+"""Limits of an object's total scale along each axis."""
 
 BLEND_STEP_US = 50_000
 """Spacing of the poses in the transition of an edit."""
@@ -189,7 +189,7 @@ BLEND_STEP_US = 50_000
 
 @object_operation(Translate)
 def translate(state: ScenarioState, subject: ObjectState, operation: Translate) -> AppliedOperation:
-    """Shift it, at all times or in a time range."""
+    """Shift an object, at all times or in a time range."""
     shift = (operation.x, operation.y, operation.z)
     track, weights = _weighted(subject.trajectory, operation.time_range)
     moved = shifted(track, shift, operation.frame, weights=weights)
@@ -201,7 +201,7 @@ def translate(state: ScenarioState, subject: ObjectState, operation: Translate) 
 
 @object_operation(Rotate)
 def rotate(state: ScenarioState, subject: ObjectState, operation: Rotate) -> AppliedOperation:
-    """Turn it about its own centre or with its path, at all times or in a time range."""
+    """Rotate an object about its centre or with its path, at all times or in a time range."""
     axis = np.array(operation.axis) / np.linalg.norm(operation.axis)
     track, weights = _weighted(subject.trajectory, operation.time_range)
     half = operation.angle / 2 * (weights if weights is not None else np.ones(1))[:, None]
@@ -229,7 +229,7 @@ def rotate(state: ScenarioState, subject: ObjectState, operation: Rotate) -> App
 
 @object_operation(Scale)
 def scale(state: ScenarioState, subject: ObjectState, operation: Scale) -> AppliedOperation:
-    """Multiply its size; the anchor stays in place."""
+    """Scale an object; the anchor stays in place."""
     factors = (operation.x, operation.y, operation.z)
     a, b, c = subject.scale
     scaled = rescaled(
@@ -243,7 +243,7 @@ def scale(state: ScenarioState, subject: ObjectState, operation: Scale) -> Appli
 
 @object_operation(SetPose)
 def set_pose(state: ScenarioState, subject: ObjectState, operation: SetPose) -> AppliedOperation:
-    """Fix its pose for the whole time range of the scene."""
+    """Set a constant pose for the whole time range of the scene."""
     stood = trajectory_of(stationary_track(operation.pose, state.time_range))
     return _follow(state, subject, stood, snap=operation.snap)
 
@@ -252,13 +252,13 @@ def set_pose(state: ScenarioState, subject: ObjectState, operation: SetPose) -> 
 def set_trajectory(
     state: ScenarioState, subject: ObjectState, operation: SetTrajectory
 ) -> AppliedOperation:
-    """Let it follow a trajectory."""
+    """Replace the trajectory of an object."""
     return _follow(state, subject, trajectory_of(operation.trajectory), snap=operation.snap)
 
 
 @object_operation(Retime)
 def retime(state: ScenarioState, subject: ObjectState, operation: Retime) -> AppliedOperation:
-    """Let it do the same at other times."""
+    """Shift or scale an object's trajectory in time."""
     old = subject.trajectory
     since = (old.times_us - old.start_us).astype(np.float64) / operation.speed
     times = old.start_us + operation.delay_us + np.rint(since).astype(np.int64)
@@ -275,7 +275,7 @@ def retime(state: ScenarioState, subject: ObjectState, operation: Retime) -> App
     return _follow(state, subject, Trajectory(times, old.positions, old.quaternions))
 
 
-# --- parts that placing and replacing need too -------------------------------------------------
+# --- shared with insertion and replacement -----------------------------------------------------
 
 
 def stationary_track(pose: Pose, time_range: tuple[int, int]) -> Track:
@@ -334,7 +334,7 @@ def shifted(
 def rescaled(
     subject: ObjectState, scale: tuple[float, float, float], *, keep_bottom: bool
 ) -> ObjectState:
-    """The object at another ``scale``, its box centre or the bottom's centre where it was.
+    """The object at another ``scale``; its box centre, or the bottom's centre, stays in place.
 
     Raises:
         EditError: INVALID_OPERATION outside ``SCALE_RANGE``.
@@ -348,7 +348,7 @@ def rescaled(
     scaled = replace(subject, scale=scale)
     if not keep_bottom:
         return scaled
-    # The origin is the box centre, so a bottom that stays lifts it by half the growth.
+    # The origin is the box centre: keeping the bottom in place raises it by half the growth.
     lift = (scaled.scaled_size[2] - subject.scaled_size[2]) / 2
     raised = shifted(subject.trajectory, (0.0, 0.0, lift), "object")
     return replace(scaled, trajectory=raised)
@@ -385,7 +385,7 @@ def _moved(
 def _weighted(
     trajectory: Trajectory, time_range: TimeRange | None
 ) -> tuple[Trajectory, Float | None]:
-    """The trajectory with poses wherever the edit's weight bends, and that weight at each [T]."""
+    """The trajectory with extra poses in the edit's transitions, and the edit's weights [T]."""
     if time_range is None:
         return trajectory, None
     times = np.union1d(trajectory.times_us, _bends(trajectory, time_range))
@@ -406,7 +406,7 @@ def _bends(trajectory: Trajectory, time_range: TimeRange) -> NDArray[np.int64]:
 
 def _ramp(start_us: int, blend_us: int) -> NDArray[np.int64]:
     if blend_us == 0:
-        # A jump: the pose before it and the pose after it, one microsecond apart.
+        # A jump needs two poses, one microsecond apart.
         return np.array([start_us - 1, start_us], dtype=np.int64)
     steps = max(2, -(-blend_us // BLEND_STEP_US))
     return start_us + np.arange(steps + 1, dtype=np.int64) * blend_us // steps

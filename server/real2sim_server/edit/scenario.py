@@ -15,7 +15,7 @@ from .apply import EditOutcome, apply_operations, replay_operations
 from .state import EditError, ScenarioState
 
 KEPT_STATES = 32
-"""Number of states in memory; an undo rebuilds older ones from the log."""
+"""Number of cached states; undo rebuilds older ones from the log."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,8 +25,8 @@ class LogEntry:
     Attributes:
         revision: increases by one with each entry, from 1.
         kind: edit, undo or redo.
-        operations: of an edit; empty for an undo or redo. Long logs may store them unparsed and
-            validate each on access.
+        operations: operations of an edit; empty for an undo or redo. Long logs may store them
+            unparsed and validate each on access.
         target: revision of the edit that was undone or redone; None for an edit.
         created_at: UTC, ISO 8601.
         who: name given by the client; empty without one.
@@ -51,14 +51,14 @@ class PlannedEntry:
 class Scenario:
     """State of a scenario, changed only by committing planned entries of its log.
 
-    Planning changes nothing: store the entry, then commit it, so that every change is on record.
-    Undo returns to the exact state before the edit, not by inverse arithmetic. Instance ids of
-    undone copies may be reused.
+    Planning changes nothing. Store the planned entry first, then commit it: every change is then on
+    record. Undo restores the exact state before the edit and uses no inverse arithmetic. Instance
+    ids of undone copies may be reused.
 
     Attributes:
         scene: name of the scene.
         scene_hash: its content hash.
-        state: after all entries.
+        state: state after all entries.
         entries: the log, oldest first.
     """
 
@@ -84,7 +84,7 @@ class Scenario:
         """The scenario after ``entries``, bit-identical to its state when they were committed.
 
         Args:
-            initial_state: before any edit.
+            initial_state: state before any edit.
             entries: the log, oldest first.
             scene: name of the scene.
             scene_hash: its content hash.
@@ -105,10 +105,10 @@ class Scenario:
         """A new scenario that continues this one with entries stored by others.
 
         Args:
-            entries: of the log after this scenario's revision, oldest first.
+            entries: entries of the log after this scenario's revision, oldest first.
 
         Raises:
-            EditError: they do not continue this scenario.
+            EditError: the entries do not continue this scenario.
         """
         longer = Scenario(self._states[0], scene=self.scene, scene_hash=self.scene_hash)
         longer.entries, longer._states = list(self.entries), self._states.copy()
@@ -143,13 +143,13 @@ class Scenario:
         """Plan ``operations`` without applying them.
 
         Args:
-            operations: applied all, or none.
-            base_revision: the revision they were made for; None for any.
-            who: recorded in the log.
+            operations: operations, applied all or none.
+            base_revision: revision that they are based on; None for any.
+            who: name recorded in the log.
 
         Raises:
-            EditError: STALE_REVISION when ``base_revision`` is not the current one; also as
-                :func:`~.apply.apply_operations`.
+            EditError: STALE_REVISION if ``base_revision`` is not the current one; also the errors
+                of :func:`~.apply.apply_operations`.
         """
         self._refuse_stale(base_revision)
         outcome = apply_operations(self.state, operations)
@@ -197,7 +197,7 @@ class Scenario:
             EditError: STALE_REVISION if another entry was committed after it was planned.
         """
         self._append(planned.entry)
-        # Kept for undo, but unlikely to be needed soon.
+        # Undo may need the old state, but probably not soon.
         self.state.forget_tracks()
         self.state = planned.outcome.state
         self._keep(len(self._done), self.state)
@@ -236,9 +236,7 @@ class Scenario:
         return LogEntry(self.revision + 1, kind, operations, target, now, who)
 
     def _append(self, entry: LogEntry) -> None:
-        """Append an entry; cached states do not change, except that those of another history are
-        dropped.
-        """
+        """Append an entry and drop cached states of another history."""
         if entry.revision != self.revision + 1:
             raise EditError(
                 ErrorCode.STALE_REVISION,
@@ -266,10 +264,9 @@ class Scenario:
         return stack.pop()
 
     def _state_after(self, count: int) -> ScenarioState:
-        """State after the first ``count`` edits in effect, from the nearest cached one.
+        """State after the first ``count`` edits in effect, computed from the nearest cached one.
 
-        The last states on the path are cached, so that repeated undo does not start from a distant
-        one each time.
+        Caches the last states on the path to make repeated undo fast.
         """
         nearest = max(n for n in self._states if n <= count)
         state = self._states[nearest]

@@ -1,4 +1,4 @@
-"""State of a scenario at one revision: objects without their Gaussians, and snapshots of it."""
+"""State of a scenario at one revision: objects without their Gaussians, and its snapshots."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class AssetSource(Protocol):
     def figure(self) -> Figure | None: ...  # noqa: D102
 
     def cloud_in(self, scene: Scene) -> GaussianCloud:
-        """Its Gaussians in the light of ``scene``."""
+        """The asset's Gaussians, adapted to the light of ``scene``."""
         ...
 
 
@@ -58,7 +58,7 @@ AssetLookup = Callable[[str], "AssetSource | None"]
 
 
 class SceneSource(Protocol):
-    """Required properties of a scene: a Scene, or the summary of one that is not in memory."""
+    """Required properties of a scene; a Scene, or a summary of a scene that is not in memory."""
 
     @property
     def objects(self) -> Mapping[str, ObjectSource] | Iterable[ObjectSource]: ...  # noqa: D102
@@ -74,19 +74,19 @@ class ObjectState:
 
     Attributes:
         object_id: unique in the scenario, also among deleted objects.
-        source_id: object of the scene with its Gaussians; empty if it shows an asset.
-        category: as in the scene.
+        source_id: scene object with its Gaussians; empty if it shows an asset.
+        category: category in the scene.
         size: (length, width, height) in the scene, before ``scale`` [m].
         scale: factors along the object's x, y, z, about its origin.
         trajectory: ``T_world_object``; origin at the box centre; exists only in its range.
         instance_id: value of its pixels in instance images; fixed while the object exists.
-        deleted: a tombstone: invisible, without collisions, its id stays reserved.
-        asset: shown instead of an object of the scene.
+        deleted: whether it is a tombstone: invisible, without collisions, id still reserved.
+        asset: asset shown instead of a scene object.
         physics: physical properties; None for all defaults.
         velocity: initial velocity in the physics; None for the trajectory's.
         gait: walking style; None if no edit has set it.
         edited: whether an edit set its trajectory or its appearance.
-        driver: moves it in sessions; None if sessions decide.
+        driver: driver model in sessions; None if sessions decide.
     """
 
     object_id: str
@@ -132,20 +132,20 @@ class ObjectState:
 
 @dataclass(frozen=True, eq=False)
 class ScenarioState:
-    """All objects of a scenario at one revision. Immutable; edits make new states that share parts.
+    """All objects of a scenario at one revision. Immutable; edits create states that share parts.
 
     Attributes:
-        objects: by id in a stable order: those of the scene, then copies in order of creation.
-        next_instance_id: for the next new object.
+        objects: objects by id in a stable order: scene objects, then copies by creation.
+        next_instance_id: instance id of the next new object.
         time_range: first and last time of the scene's clock [us].
         clock: first and last time of the scenario, within ``time_range`` [us].
         regions: boxes erased from the background, by id, including deleted ones.
-        colliders: by id, including deleted ones.
+        colliders: colliders by id, including deleted ones.
         tombstones: ids of deleted regions and colliders.
-        storyboard: default storyboard of episodes; None: none.
-        recorded: the objects of the scene, by id.
-        ground: of the scene.
-        assets: the asset library, or None if there is none.
+        storyboard: default storyboard of episodes, or None.
+        recorded: objects of the scene, by id.
+        ground: ground of the scene.
+        assets: the asset library, or None.
         extent: [2, 2] lowest and highest x, y that the ego or an object reaches in the scene [m].
     """
 
@@ -164,7 +164,7 @@ class ScenarioState:
 
     @classmethod
     def of(cls, scene: SceneSource, *, assets: AssetLookup | None = None) -> ScenarioState:
-        """The state before any edit, of a Scene or of a summary of one."""
+        """The state of a scene before any edit."""
         given = scene.objects
         sources = list(given.values() if isinstance(given, Mapping) else given)
         objects = {
@@ -193,7 +193,7 @@ class ScenarioState:
         )
 
     def with_object(self, changed: ObjectState) -> ScenarioState:
-        """The state with ``changed`` in place of the object with its id, or added at the end."""
+        """The state with ``changed``, which replaces the object with its id or is appended."""
         objects = dict(self.objects)
         objects[changed.object_id] = changed
         return replace(
@@ -203,7 +203,7 @@ class ScenarioState:
         )
 
     def has_id(self, wanted: str) -> bool:
-        """Whether an object, region or collider has this id, deleted ones included."""
+        """Whether an object, region or collider has this id, including deleted ones."""
         return wanted in self.objects or wanted in self.regions or wanted in self.colliders
 
     @property
@@ -223,7 +223,7 @@ class ScenarioState:
 
     @cached_property
     def tracks(self) -> PackedTracks[ObjectState]:
-        """Trajectories of the visible objects, packed once for look-ups at one instant."""
+        """Packed trajectories of the visible objects, for lookups at one instant; cached."""
         return PackedTracks(tuple(o for o in self.objects.values() if not o.deleted))
 
     def forget_tracks(self) -> None:
@@ -245,7 +245,7 @@ class EditError(ValueError):
         code: UNKNOWN_OBJECT, INVALID_OPERATION, STALE_REVISION, NOTHING_TO_UNDO or
             NOTHING_TO_REDO.
         hint: suggested next step, or None.
-        index: of the rejected operation in its batch, or None.
+        index: index of the rejected operation in its batch, or None.
     """
 
     def __init__(
@@ -259,7 +259,7 @@ class EditError(ValueError):
 
 # --- Snapshots -----------------------------------------------------------------------------------
 
-# A state as bytes and back, bit for bit, so that a long log need not be replayed whole.
+# Exact serialisation of states; long logs are then replayed only from a snapshot on.
 
 MAX_BYTES = 256 * 1024 * 1024
 _DRIVER: TypeAdapter[AgentDriver] = TypeAdapter(AgentDriver)
@@ -286,7 +286,7 @@ def unpack_state(initial: ScenarioState, packed: bytes) -> ScenarioState:
     """The state packed by :func:`pack_state`.
 
     Args:
-        initial: of the same scene, before any edit.
+        initial: state of the same scene before any edit.
         packed: the bytes.
 
     Raises:

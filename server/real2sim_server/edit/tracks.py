@@ -1,4 +1,4 @@
-"""Many trajectories looked up at one instant, and one trajectory at many instants."""
+"""Lookup of many trajectories at one instant, and of one trajectory at many instants."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from ..scene import Trajectory
 # --- Kernels -------------------------------------------------------------------------------------
 
 KNOT = 11
-"""Numbers of a knot: position [3], quaternion wxyz [4], velocity [3], and whether the quaternion
-of the next knot is another one."""
+"""Values per knot: position [3], quaternion wxyz [4], velocity [3], and whether the quaternion of
+the next knot differs."""
 
 
 @kernel
@@ -29,12 +29,12 @@ def poses_at(t_us, ends, times, knots):
     Args:
         t_us: int64 [us].
         ends: [N + 1] int64; trajectory k has the knots from ``ends[k]`` to ``ends[k + 1]``.
-        times: [M] int64, of all knots, increasing within each trajectory [us].
+        times: [M] int64 times of all knots, increasing within each trajectory [us].
         knots: [M, 11] float64, see ``KNOT``; [m], [m/s].
 
     Returns:
         Indices of the trajectories [K] int64, and in float64 positions [K, 3], quaternions
-        [K, 4], velocities [K, 3] and transforms [K, 4, 4]. At a knot its pose, bit for bit.
+        [K, 4], velocities [K, 3] and transforms [K, 4, 4]. Poses at a knot are exact.
     """
     known, after = _covering(t_us, ends, times)
     count = len(known)
@@ -58,7 +58,7 @@ def poses_at(t_us, ends, times, knots):
 
 @kernel
 def _covering(t_us, ends, times):
-    """Trajectories that cover ``t_us`` [K], and the first knot of each that is not before it."""
+    """Trajectories that cover ``t_us`` [K], and the first knot of each at or after ``t_us``."""
     known, after = np.empty(len(ends) - 1, np.int64), np.empty(len(ends) - 1, np.int64)
     count = 0
     for k in range(len(ends) - 1):
@@ -78,7 +78,7 @@ def _covering(t_us, ends, times):
 
 @kernel
 def _slerp(start, end, fraction, found):
-    """Quaternion [4] between two knots, on the shorter arc; as ``scene.rotation.slerp``."""
+    """Quaternion [4] between two knots, along the shorter arc; like ``scene.rotation.slerp``."""
     dot = 0.0
     for c in range(3, 7):
         dot += start[c] * end[c]
@@ -133,7 +133,7 @@ class PlacedObjects(Generic[T]):
     """The K objects that exist at one instant.
 
     Attributes:
-        objects: in the state's order.
+        objects: objects in the state's order.
         sizes: [K, 3] float64, (length, width, height) of their boxes [m].
         positions: [K, 3] float64, box centres in the world [m].
         quaternions: [K, 4] float64, wxyz.
@@ -150,11 +150,11 @@ class PlacedObjects(Generic[T]):
 
 
 class PackedTracks(Generic[T]):
-    """Trajectories of many objects in common arrays, so that one lookup serves all.
+    """Trajectories of many objects in common arrays, for one lookup of all objects.
 
     Attributes:
-        objects: in the given order, N of them.
-        sizes: [N, 3] float64, their boxes [m].
+        objects: the N objects, in the given order.
+        sizes: [N, 3] float64, sizes of their boxes [m].
         lower, upper: [N, 3] float64, lowest and highest position of each trajectory [m].
     """
 
@@ -171,18 +171,17 @@ class PackedTracks(Generic[T]):
         self._knots[:, :3] = _stacked([t.positions for t in trajectories], 3)
         self._knots[:, 3:7] = _stacked([t.quaternions for t in trajectories], 4)
         self._knots[:, 7:10] = _stacked([_knot_velocities(t) for t in trajectories], 3)
-        # Objects that are stationary or drive straight need no slerp.
+        # Objects with constant rotation need no slerp.
         quaternions = self._knots[:, 3:7]
         self._knots[:-1, 10] = (quaternions[1:] != quaternions[:-1]).any(axis=1)
 
     @property
     def arrays(self) -> tuple[NDArray[np.int64], NDArray[np.int64], Float]:
-        """Ends, times [us] and knots of all trajectories, as :func:`.poses_at` takes
-        them."""
+        """Ends, times [us] and knots of all trajectories, for :func:`.poses_at`."""
         return self._ends, self._times, self._knots
 
     def at(self, t_us: int) -> PlacedObjects[T]:
-        """Objects whose trajectory covers ``t_us``; poses and velocities as Trajectory has them."""
+        """Objects whose trajectory covers ``t_us``, with the poses and velocities of Trajectory."""
         known, positions, quaternions, velocities, transforms = poses_at(
             t_us, self._ends, self._times, self._knots
         )
@@ -199,20 +198,20 @@ class PackedTracks(Generic[T]):
         )
 
     def _some(self, known: NDArray[np.int64]) -> tuple[tuple[T, ...], Float]:
-        """Objects by index, and their sizes; the same tuple while they do not change."""
+        """Objects by index, and their sizes; returns the same tuple for unchanged indices."""
         places = known.tobytes()
         newest = self._newest
         if newest is None or newest[0] != places:
             objects = tuple([self.objects[i] for i in known.tolist()])
-            # One assignment, for worlds on other threads may look here too.
+            # A single assignment, because other threads may read this too.
             self._newest = newest = (places, objects, self.sizes[known])
         return newest[1], newest[2]
 
 
 def sample(trajectory: Trajectory, times_us: NDArray[np.int64]) -> tuple[Float, NDArray[np.bool_]]:
-    """``T_world_object`` [S, 4, 4] at ``times_us`` [S], and where the trajectory covers them [S].
+    """``T_world_object`` [S, 4, 4] at ``times_us`` [S], and whether the trajectory covers each [S].
 
-    Entries that are not covered hold the nearest known pose.
+    Outside the trajectory, entries have the nearest pose.
     """
     times = trajectory.times_us
     covered = (times_us >= times[0]) & (times_us <= times[-1])
@@ -220,9 +219,9 @@ def sample(trajectory: Trajectory, times_us: NDArray[np.int64]) -> tuple[Float, 
 
 
 def sample_poses(trajectory: Trajectory, times_us: NDArray[np.int64]) -> tuple[Float, Float]:
-    """Positions [S, 3] and quaternions [S, 4] at ``times_us`` [S]; the nearest known pose outside.
+    """Positions [S, 3] and quaternions [S, 4] at ``times_us`` [S]; the nearest pose outside.
 
-    Stored poses are returned bit for bit.
+    Stored poses are returned exactly.
     """
     times = trajectory.times_us
     clipped = np.clip(times_us, times[0], times[-1])

@@ -1,5 +1,5 @@
-"""Comparison of planners: many episodes of many planners, their scores, an HTML page, and a policy
-trained by behaviour cloning.
+"""Planner comparison over many episodes, with scores and an HTML page, and a policy trained by
+behaviour cloning.
 
-The SDK drives the episodes, like a user, and scores come from the worker's recordings.
+Episodes are driven through the SDK. Scores are computed from the worker's recordings.
 """

@@ -1,4 +1,4 @@
-"""Behaviour cloning: a small network learns to drive as the recording vehicle did."""
+"""Behaviour cloning: a small network learns to drive like the recording vehicle."""
 
 from __future__ import annotations
 
@@ -33,21 +33,21 @@ if TYPE_CHECKING:
 # --- Posed images --------------------------------------------------------------------------------
 
 PERIOD_US = 100_000
-"""Interval of the rendered images."""
+"""Time between rendered images."""
 LATERAL_SIGMA, YAW_SIGMA = 1.0, 0.12
-"""Standard deviations of perturbed poses, clipped at two of them [m], [rad]."""
+"""Standard deviations of perturbed poses, clipped at two standard deviations [m], [rad]."""
 
 
 @dataclass(frozen=True, eq=False)
 class PosedImage:
-    """One image and where it was taken.
+    """One image and its pose.
 
     Attributes:
         rgb: uint8 [H, W, 3].
-        t_us: instant.
-        T_world_vehicle: [4, 4] float64, of the vehicle that carries the camera.
-        frame: number of the instant.
-        count: of all images of the drive.
+        t_us: time of the image.
+        T_world_vehicle: [4, 4] float64, pose of the vehicle with the camera.
+        frame: index of the instant.
+        count: number of all images of the drive.
     """
 
     rgb: NDArray[np.uint8]
@@ -131,10 +131,10 @@ def build_dataset(
     Args:
         ego: the recorded drive.
         shape: input and output of the network.
-        images: on the path of the drive, or next to it.
+        images: images on the path of the drive or next to it.
 
     Raises:
-        CommandError: too few are left.
+        CommandError: too few images remain.
     """
     path = LoggedPath(ego)
     inputs, states, poses, held_out = [], [], [], []
@@ -160,7 +160,7 @@ def expert_poses(
     ego: Trajectory, shape: PolicyShape, image: PosedImage
 ) -> NDArray[np.float32] | None:
     """[K, 3] future poses (x, y, yaw) of the recording vehicle, in the frame of the image's
-    vehicle, in units of the network; None if the recording ends before.
+    vehicle, in units of the network; None if the recording ends earlier.
     """
     delays = (np.arange(shape.poses) + 1) * shape.spacing
     times = image.t_us + np.round(delays * 1e6).astype(np.int64)
@@ -168,7 +168,7 @@ def expert_poses(
         return None
     T_vehicle_world = np.linalg.inv(image.T_world_vehicle)
     T_vehicle_ego = T_vehicle_world @ transform_from(*ego.pose(image.t_us))
-    # The offset from the path fades, with a slope of 0 at its end.
+    # The offset from the path decays to 0, with slope 0 at the end.
     remaining = np.clip(1.0 - delays / RECOVERY_TIME, 0.0, 1.0) ** 2
     poses = np.empty((shape.poses, 3))
     for k, t_us in enumerate(times.tolist()):
@@ -193,19 +193,19 @@ def train_network(
 
     Args:
         dataset: examples.
-        shape: of the network.
+        shape: shape of the network.
         epochs: passes over the dataset.
-        seed: of weights, order and brightness; the same seed gives the same bits.
+        seed: seed of weights, order and brightness; results for a seed are bit-identical.
         on_progress: called with (epochs done, all).
 
     Returns:
-        Weights by name, and figures: their number, mean position errors [m] on training and
-        held-out examples.
+        Weights by name, and figures: the number of weights, and mean position errors [m] on
+        training and held-out examples.
     """
     import torch
 
     threads = torch.get_num_threads()
-    # The network is too small for several threads, and one thread gives the same bits everywhere.
+    # The network is too small for several threads, and one thread is reproducible everywhere.
     torch.set_num_threads(1)
     try:
         torch.manual_seed(seed)
@@ -255,7 +255,7 @@ def _optimise(
 
 
 def _position_errors(model: torch.nn.Module, tensors: tuple[torch.Tensor, ...]) -> torch.Tensor:
-    """[N] mean distance of predicted from driven positions [m]."""
+    """[N] mean distance between predicted and driven positions [m]."""
     import torch
 
     images, states, poses = tensors
@@ -281,7 +281,7 @@ def _yaw(T_world_vehicle: NDArray[np.float64]) -> float:
 
 TRAIN = "train"
 LAYOUT = "labels"
-"""Name of the format that is read, and of its folder in an export."""
+"""Name of the supported format, and of its folder in an export."""
 
 
 def is_export(folder: Path) -> bool:
@@ -290,10 +290,10 @@ def is_export(folder: Path) -> bool:
 
 
 def exported_shape(folder: Path, camera: str | None) -> PolicyShape:
-    """The shape of a policy for ``camera`` of an export, by default the most forward-looking one.
+    """The shape of a policy for ``camera`` of an export; default: the most forward-looking one.
 
     Raises:
-        CommandError: there is no such camera, or the export has only other formats.
+        CommandError: the camera does not exist, or the export has only other formats.
     """
     found = _content(folder)["cameras"]
     cameras = {one["name"]: np.array(one["T_vehicle_camera"]) for one in found}
@@ -309,14 +309,14 @@ def exported_examples(
     *,
     on_progress: Callable[[int, int], None] = lambda _done, _total: None,
 ) -> CloningDataset:
-    """All frames of exports that cover a whole plan; ``ego_future`` is the plan.
+    """All frames of exports whose ``ego_future`` covers a whole plan.
 
-    Clips of splits other than ``train`` are held out; without such clips, every fifth frame of each
-    clip.
+    Clips of splits other than ``train`` are held out. Without such clips, every fifth frame of each
+    clip is held out.
 
     Args:
         folders: exports with the format ``labels``.
-        shape: of :func:`exported_shape`.
+        shape: result of :func:`exported_shape`.
         on_progress: called with (clips read, all).
 
     Raises:

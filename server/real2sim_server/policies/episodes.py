@@ -1,4 +1,4 @@
-"""Episodes driven, recorded and scored, several at a time, with planners in their own processes."""
+"""Drives, records and scores episodes in parallel, with planners in separate processes."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ if TYPE_CHECKING:
 
 # --- Planner processes ---------------------------------------------------------------------------
 
-# A planner that ends its process ends only its own episode.
+# A planner that exits its process fails only its own episode.
 
 STILLS, STILL_WIDTH = 6, 320
 END_S = 10.0
-"""So long an idle process has to end [s]."""
+"""Time limit for an idle process to exit [s]."""
 
 
 @dataclass(frozen=True)
@@ -40,9 +40,9 @@ class WorkerTarget:
     """The worker that episodes run on.
 
     Attributes:
-        url, token: of the worker.
-        sessions: how many at a time.
-        timeout: seconds that a reply may take.
+        url, token: address and token of the worker.
+        sessions: maximum number of sessions at a time.
+        timeout: maximum seconds to wait for a reply.
     """
 
     url: str
@@ -61,9 +61,9 @@ class PlannedEpisode:
 
     Attributes:
         policy: name of the planner.
-        case, seed: of the episode.
+        case, seed: case and seed of the episode.
         target: the worker.
-        session_id, token: of the session.
+        session_id, token: id and token of the session.
     """
 
     policy: str
@@ -79,8 +79,8 @@ class DrivenEpisode:
     """Report of a planner's process about an episode.
 
     Attributes:
-        reason: of the end; None if the planner failed.
-        error: exception of the planner, rejection, or end of its process.
+        reason: reason for the end; None if the planner failed.
+        error: exception of the planner, rejection of a plan, or exit of the process.
         times_ms: median times of the stages [ms].
         stills: (seconds since the start, JPEG) of the forward camera.
     """
@@ -92,9 +92,9 @@ class DrivenEpisode:
 
 
 class PlannerProcess:
-    """A process in which planners drive, one episode after another.
+    """A process that runs planners, one episode after another.
 
-    If a planner ends the process, the next episode starts a new one.
+    If a planner exits the process, the next episode starts a new one.
     """
 
     def __init__(self) -> None:
@@ -117,7 +117,7 @@ class PlannerProcess:
         """Drive an episode.
 
         Raises:
-            Real2SimError: the worker refuses, or has ended.
+            Real2SimError: the worker refuses a request or has ended.
             ValueError: the planner cannot drive in this scene.
         """
         told = self._asked(episode)
@@ -129,7 +129,7 @@ class PlannerProcess:
         return driven
 
     def _asked(self, what: str | PlannedEpisode) -> Any:
-        """The process's answer, or its exit code where it has ended instead."""
+        """The process's answer, or its exit code if it has ended."""
         if self._pipe is None:
             context = multiprocessing.get_context("spawn")
             self._pipe, other = context.Pipe()
@@ -202,7 +202,7 @@ def _driven(episode: PlannedEpisode) -> DrivenEpisode:
 
 
 class _IsolatedPlanner:
-    """A planner whose exceptions end its own episode only; it applies the edits of the case."""
+    """Wraps a planner: its exceptions fail only its own episode. Applies the edits of the case."""
 
     def __init__(self, planner: Any, session: DriveSession, case: Case) -> None:
         self._planner, self._session, self._case = planner, session, case
@@ -232,7 +232,7 @@ class _IsolatedPlanner:
                 return valid_plan(plan)
             except ValueError as error:
                 self.error = f"plan refused: {error}"
-        # The rest of a failed episode is driven standing still, so that it ends as any other.
+        # After a failure, the vehicle stands still to the end of the episode.
         return _standstill_plan(obs, needs_of(self._planner).action)
 
     @contextlib.contextmanager
@@ -281,12 +281,12 @@ class EpisodeResult:
     """A finished episode.
 
     Attributes:
-        policy, case, seed: of the episode.
-        file: its recording.
-        recording: read from the file.
-        reason: of the end.
-        error: exception of the planner, rejection, or end of its process; such an episode has no
-            scores.
+        policy, case, seed: planner, case and seed of the episode.
+        file: file of its recording.
+        recording: recording in the file.
+        reason: reason for the end.
+        error: exception of the planner, rejection of a plan, or exit of its process; such an
+            episode has no scores.
         figures: steps, seconds, times.
         stills: (seconds since the start, JPEG) of the forward camera.
     """
@@ -302,7 +302,7 @@ class EpisodeResult:
     stills: Sequence[tuple[float, bytes]] = ()
 
     def scores(self) -> dict[str, dict[str, Any]]:
-        """Scores by name, computed from the recording; none for an episode that failed."""
+        """Scores by name, computed from the recording; empty for a failed episode."""
         if self.error is not None:
             return {}
         return {score.name: score.fields() for score in self.recording.rescore()}
@@ -320,11 +320,11 @@ def run_episodes(
     Args:
         grid: episodes to run.
         target: the worker.
-        folder: for recordings, as ``case/policy/seed.r2e``.
+        folder: folder of the recordings, ``case/policy/seed.r2e``.
         on_progress: called with (done, all).
 
     Raises:
-        Real2SimError: the worker refuses, or has ended.
+        Real2SimError: the worker refuses a request or has ended.
         ValueError: an unknown planner, or one that cannot drive in a scene.
     """
     episodes = grid.episodes()

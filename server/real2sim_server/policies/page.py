@@ -1,4 +1,4 @@
-"""Pictures of episodes, and one HTML page that compares planners. The page loads nothing."""
+"""Pictures of episodes, and a self-contained HTML page that compares planners."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def plot_curves(results: Sequence[EpisodeResult], policies: Sequence[str]) -> by
 
 
 def plot_paths(results: Sequence[EpisodeResult], policies: Sequence[str]) -> bytes:
-    """Driven paths from above, two in a row, with every object where it ended."""
+    """Top views of driven paths, two per row, with every object at its final pose."""
     plt = _pyplot()
     low, high = _extent([one.recording for one in results])
     rows = -(-len(results) // 2)
@@ -140,7 +140,7 @@ def _track(recording: Recording, object_id: str) -> Array:
 
 
 def rectangle_corners(centre: Array, yaw: float, size: Array) -> Array:
-    """[4, 2] corners, in order around, of a box of ``size`` seen from above [m]."""
+    """[4, 2] corners of a box of ``size`` seen from above, in cyclic order [m]."""
     c, s = math.cos(yaw), math.sin(yaw)
     local = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) * size[:2] / 2
     corners: Array = local @ np.array([[c, s], [-s, c]]) + centre
@@ -196,11 +196,11 @@ def film_episode(
 
     Args:
         recording: the episode.
-        replayer: of it, before its first entry.
-        scene: of the episode.
+        replayer: replayer of the episode, before its first entry.
+        scene: scene of the episode.
         path: file to write.
-        camera: name; None: the first one.
-        width: of the film [px].
+        camera: camera name; None: the first one.
+        width: width of the film [px].
     """
     chosen = scene.rig[camera or scene.rig.names[0]].resized(width)
     backend = select_backend("auto")
@@ -246,7 +246,7 @@ def _draw_caption(image: Image, world: World) -> None:
 
 
 def _draw_map(image: Image, world: World) -> None:
-    """Into the lower right corner: seen from above, the ego heading up."""
+    """Draw a top view, with the ego heading up, into the lower right corner."""
     size = min(MAP_PIXELS, image.shape[0] // 2, image.shape[1] // 2)
     scale, motion = size / MAP_METRES, world.motion
     drawn = np.full((size, size, 3), BACKGROUND, np.uint8)
@@ -277,7 +277,7 @@ def _draw_map(image: Image, world: World) -> None:
 
 @dataclass(frozen=True)
 class ScoreStatistics:
-    """Mean over ``count`` episodes, and standard deviation (of the population) over several."""
+    """Mean over ``count`` episodes, and population standard deviation if there are several."""
 
     mean: float
     deviation: float | None
@@ -285,7 +285,7 @@ class ScoreStatistics:
 
     @classmethod
     def of(cls, values: Sequence[float]) -> ScoreStatistics | None:
-        """Statistics of values; None without any."""
+        """Statistics of values; None for no values."""
         if not values:
             return None
         deviation = statistics.pstdev(values) if len(values) > 1 else None
@@ -297,11 +297,11 @@ class ScoreGroup:
     """Episodes of one planner in one case, or in all cases if ``case`` is None.
 
     Attributes:
-        scores: by name; None if undefined in every episode, or if the planner failed in any: a mean
-            over the others would be biased in its favour.
-        collisions, at_fault: summed.
-        reasons: of the ends, counted.
-        failed: episodes in which the planner raised, or sent an infeasible action.
+        scores: statistics by name; None if undefined in every episode, or if the planner failed in
+            any, because a mean over the others would be biased in its favour.
+        collisions, at_fault: total numbers of collisions and of at-fault collisions.
+        reasons: number of episodes by reason for the end.
+        failed: number of episodes in which the planner raised or sent an infeasible action.
     """
 
     policy: str
@@ -336,7 +336,7 @@ class ScoreGroup:
 
 
 def group_scores(results: Sequence[EpisodeResult]) -> list[ScoreGroup]:
-    """Every planner over all cases, then every planner in every case; in their order."""
+    """Summaries of every planner over all cases, then of every planner in every case, in order."""
     policies, cases = _unique(d.policy for d in results), _unique(d.case for d in results)
     groups = []
     for case in (None, *cases):
@@ -347,7 +347,7 @@ def group_scores(results: Sequence[EpisodeResult]) -> list[ScoreGroup]:
 
 
 def report_figures(results: Sequence[EpisodeResult], folder: Path) -> dict[str, Any]:
-    """All results as JSON values; files relative to ``folder``."""
+    """All results as JSON values; file paths are relative to ``folder``."""
     return {
         "metrics": metric_versions(),
         "groups": [asdict(group) for group in group_scores(results)],
@@ -370,10 +370,10 @@ def report_figures(results: Sequence[EpisodeResult], folder: Path) -> dict[str, 
 
 
 def unconfirmed_scores(figures: dict[str, Any], folder: Path) -> list[str]:
-    """Episodes of a report with scores that differ from their recordings; empty if all agree.
+    """Episodes of a report whose scores differ from their recordings; empty if all agree.
 
     Args:
-        figures: from ``report_figures``.
+        figures: result of ``report_figures``.
         folder: base of their relative file paths.
     """
     differing = []
@@ -452,7 +452,7 @@ def _head(
 
 
 def _blind_spots(one: EpisodeResult) -> str:
-    """Expandable list of the blind spots of an episode's scores."""
+    """Expandable list of the limits of an episode's scores."""
     if one.error is not None:
         return ""
     items = "".join(

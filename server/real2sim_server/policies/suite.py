@@ -2,7 +2,7 @@
 
 A suite is a JSON file, ``{"cases": [{"name": ..., "scene": ..., "reset": {...}}, ...]}``;
 docs/policies.md describes its format. Files in the folder ``suites`` are shipped and available by
-name: a new suite, or a new case, needs only its JSON.
+name. To add a suite or a case, add its JSON.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ SET_BY_EVALUATION = frozenset({"seed", "sensors", "action", "privileged"})
 class Case(BaseModel):
     """One kind of episode.
 
-    Every seed except 0 varies the case: each number of ``reset`` that ``jitter`` names by its path,
-    such as ``agents.drivers.car_3.gap``, is sampled uniformly from its value plus or minus the
-    given one. Times (``_us``) are rounded to clock steps. Seed 0 is the unmodified case. For every
+    ``jitter`` maps paths into ``reset``, such as ``agents.drivers.car_3.gap``, to half-ranges.
+    Every seed except 0 samples these numbers uniformly from their value plus or minus the
+    half-range. Times (``_us``) are rounded to clock steps. Seed 0 is the unmodified case. For every
     seed, the worker samples ``randomization`` and ``agents.spawn`` of ``reset``. An episode has no
     other randomness: a case without these is the same for every seed.
     """
@@ -61,7 +61,7 @@ class Case(BaseModel):
 
     @property
     def is_random(self) -> bool:
-        """Whether its episodes differ by their seeds."""
+        """Whether its episodes depend on the seed."""
         spec = ResetSpec.model_validate(self.reset)
         drawn = spec.agents.spawn is not None or spec.randomization != Randomization()
         return drawn or any(width != 0 for width in self.jitter.values())
@@ -88,8 +88,8 @@ class EpisodeGrid:
 
     Attributes:
         cases: kinds of episodes.
-        policies: planners, names for ``load_planner``.
-        seeds: of every random case; the others run only with the first one.
+        policies: names of planners for ``load_planner``.
+        seeds: seeds of every random case; other cases run only with the first seed.
     """
 
     cases: Sequence[Case]
@@ -107,10 +107,10 @@ class EpisodeGrid:
 
 
 def load_suite(suite: str | Path) -> list[Case]:
-    """Cases of a JSON file, or of the shipped suite with that name if there is no such file.
+    """Cases of a JSON file, or of the shipped suite with that name if the file does not exist.
 
     Raises:
-        CommandError: no such file or suite, or an invalid case; the message names it.
+        CommandError: no such file or suite, or an invalid case, which the message names.
     """
     path = Path(suite)
     shipped = SHIPPED_SUITES / f"{suite}.json"

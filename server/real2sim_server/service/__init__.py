@@ -1,6 +1,6 @@
 """The HTTP and WebSocket service of a worker; the only package that uses HTTP.
 
-Its parts, lowest first. Each imports only earlier ones; there are no import cycles:
+Modules and packages, lowest first. Each imports only earlier ones:
 
 - ``clock``: the worker's clock.
 - ``storage``: a ``Database`` that executes statements, and a ``Store`` of scenarios, sessions, jobs

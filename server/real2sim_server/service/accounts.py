@@ -43,7 +43,7 @@ def token_hash(token: str) -> str:
 
 
 def sealed(body: bytes, secret: str) -> bytes:
-    """A body that only the holder of ``secret`` can read; the store has the secret as a hash."""
+    """Seal a body for the holder of ``secret``; the store has only the secret's hash."""
     nonce = secrets.token_bytes(NONCE_BYTES)
     return _SEALED + nonce + _masked(body, nonce, secret)
 
@@ -92,7 +92,7 @@ MAX_FILE_BYTES = 1 << 20
 Role = Literal["observe", "drive", "edit", "administer"]
 """Permissions of a token."""
 ROLES: tuple[Role, ...] = ("observe", "drive", "edit", "administer")
-"""In increasing order; each role includes the previous ones."""
+"""Roles in increasing order; each includes the previous ones."""
 
 Rate = Annotated[float, Field(gt=0, le=1e15, allow_inf_nan=False)]
 
@@ -124,7 +124,7 @@ class NamedToken(_Strict):
 
     Attributes:
         name: name of the holder, in metrics, logs, sessions and jobs.
-        hash: hash of the token, from :func:`~.storage.tokens.token_hash`.
+        hash: hash of the token, from :func:`token_hash`.
         created_at: UTC, ISO 8601.
         limits: limits of its usage.
         role: its permissions.
@@ -216,7 +216,7 @@ def add_token(path: Path, name: str, limits: TokenLimits, *, role: Role = "admin
 
 
 def remove_token(path: Path, name: str) -> None:
-    """Remove a token from a file. Raises TokenFileError if there is none with that name."""
+    """Remove a token from a file. Raises TokenFileError if no token has that name."""
     present = read_token_file(path)
     left = tuple(token for token in present.tokens if token.name != name)
     if len(left) == len(present.tokens):
@@ -425,7 +425,7 @@ class Accounts:
         """
         if not self.needs_token:
             return self.default
-        # Looked up by hash, so that the duration reveals nothing about existing tokens.
+        # Lookup by hash: its duration reveals nothing about existing tokens.
         return self._by_hash.get(token_hash(given)) if given is not None else None
 
     def of_owner(self, name: str) -> Account:
@@ -448,7 +448,7 @@ class Accounts:
         """Update the usage on other workers from their reports.
 
         Args:
-            told: by worker ``{name: [sessions, jobs]}``.
+            told: reports ``{name: [sessions, jobs]}`` by worker.
         """
         sums: dict[str, Held] = {}
         for held in told:
@@ -498,7 +498,7 @@ class Accounts:
             log.info("tokens reloaded", tokens=len(tokens))
 
     def _again(self, before: Account | None, name: str) -> Account:
-        """A new account, which continues the counters of a removed one with the same name."""
+        """A new account. It continues the counters of a removed account with the same name."""
         account = Account(name)
         if before is not None:
             account.requests, account.refusals = before.requests, dict(before.refusals)
@@ -515,5 +515,5 @@ def _state_of(file: Path) -> object:
 
 
 def seconds_to_wait(error: OverLimitError) -> int:
-    """For ``Retry-After``: whole seconds, at least one."""
+    """Value of ``Retry-After``: whole seconds, at least one."""
     return max(1, math.ceil(error.retry_after_s))

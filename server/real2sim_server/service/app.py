@@ -48,7 +48,7 @@ PROTECTED: tuple[APIRouter, ...] = (
     jobs.exports_router,
     jobs.sweeps_router,
 )
-"""Routers behind the worker's token."""
+"""Routers that require the worker's token."""
 
 OPEN: tuple[APIRouter, ...] = (
     server.health_router,
@@ -62,7 +62,7 @@ OPEN: tuple[APIRouter, ...] = (
 
 
 def operation_id(route: APIRoute) -> str:
-    """Operation id in OpenAPI, which depends only on the function's name: ``scenes-render``."""
+    """Operation id in OpenAPI, derived from the function's name, such as ``scenes-render``."""
     subject = str(route.tags[0]) if route.tags else "worker"
     return f"{subject}-{route.name}"
 
@@ -122,7 +122,7 @@ def create_app(settings: Settings) -> FastAPI:
     if settings.traces_url is not None:
         trace(app, worker, traces_to(settings.traces_url, worker_id=settings.worker_id))
     app.add_middleware(RequestContext, metrics=worker.metrics, on_end=partial(note_request, worker))
-    # Shared: include_router() would make FastAPI prepare all routes again for each application.
+    # Routers are shared: include_router() would prepare all routes again for each application.
     app.router.routes.extend(CALLS.routes)
     return app
 

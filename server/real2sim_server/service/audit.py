@@ -1,6 +1,6 @@
 """The audit log: every request that changes something or is refused for its token or role.
 
-Entries are written in the background, so that no request waits for them.
+Entries are written in the background; no request waits for them.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ class AuditEntry:
         account: name of the token; empty without a valid one.
         client: address of the client.
         worker_id: worker that answered.
-        method, path: of the request.
+        method, path: method and path of the request.
         status: status of the reply.
-        request_id: as in the reply and the log.
+        request_id: request id in the reply and the log.
         at_us: wall clock [us].
     """
 
@@ -52,7 +52,7 @@ class AuditLog:
     """Stored entries.
 
     Args:
-        store: open while this is used.
+        store: an open store.
     """
 
     def __init__(self, store: Store) -> None:
@@ -93,7 +93,7 @@ class Audit:
     """Collects entries and stores them, for use on the event loop.
 
     Args:
-        audit_log: stores them.
+        audit_log: stores the entries.
     """
 
     def __init__(self, audit_log: AuditLog) -> None:
@@ -120,7 +120,7 @@ class Audit:
                 await self.flush()
 
     async def flush(self) -> None:
-        """Write pending entries. Raises StoreError: they stay pending."""
+        """Write pending entries. Raises StoreError; the entries then stay pending."""
         entries = list(self._waiting)
         if not entries:
             return
@@ -134,6 +134,6 @@ class Audit:
             try:
                 await self.flush()
             except StoreError:
-                continue  # it tells of its trouble itself
+                continue  # the store logs its own errors
             except Exception:
                 log.exception("audit failed")

@@ -48,7 +48,7 @@ class CommandProcess:
     """A ``real2sim`` command in a child process, started by :meth:`run`.
 
     Attributes:
-        told: newest line of JSON on its standard output, if followed; None before the first.
+        told: newest JSON line of its standard output, if followed; None before the first line.
     """
 
     def __init__(self, process: asyncio.subprocess.Process) -> None:
@@ -97,7 +97,7 @@ class CommandProcess:
             os.setpriority(os.PRIO_PROCESS, self._process.pid, NICENESS)
 
     async def error(self) -> str | None:
-        """Its last error output if it failed; after its end."""
+        """The last error output of a failed process, once it has ended."""
         if await self._process.wait() == 0:
             return None
         said = (await self._errors).decode("utf-8", "replace").split("\n")
@@ -144,13 +144,13 @@ async def _last_of(stream: asyncio.StreamReader) -> bytes:
 # --- The planner's process -----------------------------------------------------------------------
 
 EPISODE_STEPS = 100_000
-"""More steps than any recording has: the drive ends with its episode."""
+"""Exceeds the steps of any recording; the drive ends with its episode."""
 
 OF_THE_PLANNER = {
     *("sensors", "lidars", "radars", "action", "privileged"),
     *("seed", "dt_us", "warmup_us"),
 }
-"""Options of a reset that the planner sets itself, or that the command has options for."""
+"""Options of reset that the planner sets, or that have their own command-line option."""
 
 
 async def start_planner(
@@ -193,7 +193,8 @@ def playback_of(recording: Recording, drive: EpisodeDrive, *, reason: str | None
 
     ``tracks``, ``ego`` and ``times_us`` are as in a physics rollout (`rollouts.describe`).
     ``metrics`` has a list per score; ``plans`` has the planned poses (x [m], y [m], yaw [rad],
-    world) of each step; ``speeds`` are those of the ego [m/s]; ``reason`` is why the episode ended.
+    world) of each step; ``speeds`` has the ego's speeds [m/s]; ``reason`` is the reason for the
+    episode's end.
     """
     worlds = drive.worlds
     seen = [world.observe() for world in worlds]
@@ -248,7 +249,7 @@ def _tracks(worlds: tuple[World, ...]) -> dict[str, Any]:
 
 
 def _plans(recording: Recording, worlds: tuple[World, ...]) -> list[Any]:
-    """Planned poses of each step; none if the plan is held, or is not a trajectory."""
+    """Planned poses of each step; empty if the plan is held or is not a trajectory."""
     by_step = {world.steps: world for world in worlds}
     plans = dict[int, Any]()
     for entry in recording.entries:
@@ -309,7 +310,7 @@ class Drives:
         """Let a planner drive, and save the recording when the episode ends.
 
         Raises:
-            ServiceError: as for jobs.
+            ServiceError: the errors of ``Jobs.start``.
         """
         row = seat.session.row
 
@@ -349,7 +350,7 @@ class Drives:
         """Video source of a finished drive, seen from its own vehicle.
 
         Raises:
-            ServiceError: UNKNOWN_JOB, JOB_NOT_DONE, JOB_FAILED; or as for the scene cache.
+            ServiceError: UNKNOWN_JOB, JOB_NOT_DONE, JOB_FAILED; also the errors of the scene cache.
         """
         drive = self._opened.get(job_id)
         if drive is None:

@@ -101,7 +101,7 @@ async def export_video(
 async def _render_frame(
     renderer: Renderer, render_request: RenderRequest, context: JobContext
 ) -> EncodedFrame:
-    """The frame, rendered when the queue has room besides interactive requests."""
+    """Render the frame; while the engine's queue is full, wait and retry."""
     while True:
         try:
             return (await renderer.render(render_request, stream="export")).frames[0]
@@ -154,8 +154,9 @@ def _render_request(video_source: VideoSource, sensor: SensorSpec, t_us: int) ->
 
 
 def pack(folder: Path, archive: Path, context: JobContext) -> None:
-    """Pack all files below a folder, reproducibly: without dates, users or permissions. Each file
-    is deleted once packed, so that the disk stores it only once.
+    """Pack all files below a folder reproducibly: without dates, users or permissions.
+
+    Deletes each file once it is packed, to save disk space.
 
     Raises:
         JobCancelled: the job was cancelled.
@@ -187,7 +188,7 @@ ROOM_CHECKS_S = 5.0
 """Interval of disk space checks while frames are labelled [s]."""
 
 FEW_FRAMES = 12
-"""Smaller exports start without an estimate, which takes as long as three frames."""
+"""Smaller exports start without an estimate; estimating takes as long as three frames."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,8 +196,8 @@ class DatasetSource:
     """Content of a data set.
 
     Attributes:
-        variants: what to label.
-        made_of: other inputs, for the manifest.
+        variants: drives to label.
+        made_of: other inputs, listed in the manifest.
     """
 
     variants: Sequence[Variant]
@@ -205,7 +206,7 @@ class DatasetSource:
 
 @dataclass(eq=False)
 class EngineBackend:
-    """Renders on the engine, whose thread owns the device, between other work.
+    """Renders on the engine's thread, which owns the device, between other work.
 
     Attributes:
         engine: the engine.
@@ -229,11 +230,11 @@ class EngineBackend:
 
     @property
     def draws_lenses(self) -> bool:
-        """As for the backend that renders."""
+        """Whether the engine's backend renders lenses."""
         return getattr(self.backend, "draws_lenses", False)
 
     def rasterize(self, request: RasterRequest) -> RenderOutput:
-        """Render when the queue has room besides interactive requests. Raises JobCancelled."""
+        """Render with low priority; waits while the queue is full. Raises JobCancelled."""
         yielding = replace(request, between=self.engine.yield_to_urgent)
         return self.on_engine(self.backend.rasterize, yielding)
 
@@ -323,8 +324,8 @@ async def make_dataset(
 
     Raises:
         JobCancelled: the job was cancelled.
-        DatasetError: as :func:`export_dataset`.
-        ServiceError: QUOTA_EXCEEDED, before or while it is made.
+        DatasetError: from :func:`export_dataset`.
+        ServiceError: QUOTA_EXCEEDED, before or during the export.
     """
     if dry_run:
         guess = await asyncio.to_thread(_estimate, source.variants, plan, backend)
@@ -344,7 +345,7 @@ def _export(
     context = backend.context
     context.folder.mkdir(parents=True, exist_ok=True)
     folder = context.folder / FOLDER
-    # Partly packed by a worker that died; the clips that it finished are stored next to it.
+    # Left by a worker that died while packing; its finished clips are stored next to it.
     shutil.rmtree(folder, ignore_errors=True)
     frames = sum(len(clip.times_us) for clip in planned_shards(source.variants, plan))
     if frames > FEW_FRAMES:
@@ -365,7 +366,7 @@ def _export(
 
 
 class _Progress:
-    """Reports the job's progress, and ends it if it exceeds the available disk space."""
+    """Reports the job's progress, and ends the job if it exceeds the available disk space."""
 
     def __init__(self, context: JobContext, quota: Quota) -> None:
         self._context = context

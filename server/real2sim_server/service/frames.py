@@ -44,7 +44,7 @@ def camera_with(camera: Camera, optics: Optics) -> Camera:
 
 
 def lens_of(spec: LensSpec) -> Lens | None:
-    """The lens of a spec. Raises SceneError for parameters that its model refuses."""
+    """The lens of a spec. Raises SceneError for invalid parameters."""
     return lens_from(spec.model_dump())
 
 
@@ -54,7 +54,7 @@ def needs_motion(sensors: Sequence[SensorSpec]) -> bool:
 
 
 def frame_names(sensor: SensorSpec, camera: Camera | None, modality: str) -> dict[str, Any]:
-    """Lens, shutter and effects of a frame; empty if there are none."""
+    """Lens, shutter and effects of a frame; empty if it has none."""
     said: dict[str, Any] = {}
     if camera is not None and camera.lens is not None:
         said["lens"] = camera.lens.model
@@ -100,13 +100,14 @@ class FollowingImage:
 def blurred(
     view: RigView, blur: MotionBlurSpec, draw: Callable[[RigView], NDArray[np.uint8]]
 ) -> NDArray[np.uint8]:
-    """The mean light of ``blur.samples`` images at even times in the exposure, which is centred on
-    that of ``view``.
+    """Motion blur: the mean linear light of ``blur.samples`` images, evenly spaced in the exposure.
+
+    The exposure is centred on the time of ``view``.
 
     Args:
         view: view of one camera, with the motion of its vehicle and of the visible objects.
         blur: exposure time and number of samples.
-        draw: renders the colour image of such a view.
+        draw: renders the colour image of a view.
     """
     total: Light | None = None
     for k in range(blur.samples):
@@ -168,7 +169,7 @@ class FrameHeader:
 
     Attributes:
         fields: members of the protocol's Frame, in order, without ``data``.
-        members: those fields, encoded, without a map header.
+        members: the encoded fields, without a map header.
         encoded: the encoded header and the beginning of ``data``.
     """
 
@@ -182,8 +183,8 @@ class EncodedFrame:
     """One image, encoded.
 
     Attributes:
-        header: everything except its bytes.
-        data: its bytes.
+        header: the frame without the image's bytes.
+        data: bytes of the image.
     """
 
     header: FrameHeader
@@ -267,7 +268,7 @@ def bytes_member(fields: Mapping[str, Any], data: Sequence[Part]) -> list[Part]:
 
 
 def _bin_header(length: int) -> bytes:
-    # Always with a 32-bit length, which msgpack's packer only uses for large values.
+    # Always a 32-bit length; msgpack's packer uses it only for large values.
     return b"\xc6" + length.to_bytes(4, "big")
 
 
@@ -306,8 +307,10 @@ def cloud_parts(cloud: Cloud) -> list[Part]:
 
 
 def deflated(columns: Sequence[NDArray[Any]]) -> bytes:
-    """Columns compressed by zlib, with the first bytes of all numbers before the second ones: these
-    hardly differ between points."""
+    """Columns compressed by zlib after a byte shuffle, because high bytes hardly vary.
+
+    The shuffle groups the first bytes of all numbers, then the second bytes, and so on.
+    """
     packer = zlib.compressobj(DEFLATE_LEVEL)
     parts = []
     for column in columns:

@@ -1,4 +1,4 @@
-"""Background jobs: they report progress, can be cancelled, and their results are stored."""
+"""Background jobs with progress, cancellation and stored results."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def interruption() -> Problem:
 
 
 def too_many_deaths(deaths: int) -> Problem:
-    """The error of a job that ``deaths`` workers died running."""
+    """The error of a job during which ``deaths`` workers died."""
     failure = ServiceError(
         ErrorCode.JOB_FAILED,
         f"{deaths} workers died while they ran this job; it is not started again",
@@ -63,7 +63,7 @@ MAX_EVENTS = 256
 """Events kept per job for clients that reconnect."""
 
 UNKNOWN_EVENTS = 1_000_000
-"""Added to the event number when a job is taken over, so that it exceeds every number that was sent
+"""Increment of the event number when a job is taken over; it must exceed every number that was sent
 but not stored."""
 
 STORE_RETRY_S = 1.0
@@ -76,7 +76,7 @@ FOLLOW_S = 0.5
 """Interval between polls of a job that another worker runs [s]."""
 
 MAX_DEATHS = 3
-"""Workers that may die running one job before it fails."""
+"""Number of workers that may die during a job before the job fails."""
 
 MAX_FINISHED_JOBS = 64
 """Finished jobs kept in memory; older ones are read from the store."""
@@ -147,7 +147,7 @@ class JobContext:
 Work = Callable[[JobContext], Awaitable[JobResult]]
 
 Rebuild = Callable[[JobInfo], Awaitable[Work]]
-"""Makes a job's work from its record, on any worker."""
+"""Creates the work of a job from its record, on any worker."""
 
 
 @dataclass(eq=False)
@@ -172,8 +172,8 @@ class NewJob:
         kind: kind of the job.
         subject: scene, session or sweep that it works on.
         request: body of the request, stored with the job.
-        who: end user that the client names.
-        light: start at once, without a queue.
+        who: end user named by the client.
+        light: whether it starts immediately, without a queue.
         portable: any worker can rebuild its work from the record, see ``Jobs.rebuild``.
     """
 
@@ -196,7 +196,7 @@ class Jobs:
         on_end: called with the kind and the final state of each job.
 
     Attributes:
-        rebuild: makes the work of a portable job from its record.
+        rebuild: creates the work of a portable job from its record.
         fetch: downloads the files of another worker's job; returns whether it succeeded.
         listen: returns a sleep function that wakes early when another worker writes.
         on_forget: called with the id of each forgotten job.
@@ -394,7 +394,7 @@ class Jobs:
         pause = self.listen()
         while True:
             if (job := self._jobs.get(job_id)) is None:
-                # It is finished, or another worker runs it.
+                # The job is finished, or another worker runs it.
                 events = [await self.get(job_id)]
                 over = events[0].over
                 await pause(0 if over else FOLLOW_S)
@@ -462,7 +462,7 @@ class Jobs:
             await self._resume(claimed)
 
     async def _resume(self, claimed: ClaimedJob) -> None:
-        """Restart a claimed job, or store why it ends."""
+        """Restart a claimed job, or store the reason for its end."""
         newest = {"event": claimed.info.event + UNKNOWN_EVENTS, "attempt": claimed.deaths + 1}
         info = claimed.info.model_copy(update=newest | {"worker": self._log.worker_id})
         again = self.rebuild
@@ -539,7 +539,7 @@ class Jobs:
                 async with self._slots[QUEUE_OF[job.info.kind]]:
                     await self._work(job)
         except asyncio.CancelledError:
-            # Cancelled in the queue, the worker stops, or another worker has taken the job over.
+            # The job was cancelled in the queue or taken over, or the worker stops.
             if job.lost:
                 return
             if self._closing and job.portable:
@@ -581,14 +581,14 @@ class Jobs:
 
     async def _become(self, job: _Job, info: JobInfo) -> None:
         info = info.model_copy(update={"event": job.info.event + 1})
-        # Store before publishing, so that what clients saw survives a crash.
+        # Store before publishing: states that clients have seen must survive a crash.
         while True:
             try:
                 await self._log.update(info, epoch=job.epoch)
                 break
             except StoreTroubleError as error:
                 if self._closing:
-                    # The next run finds it unfinished and marks it.
+                    # The next run finds the job unfinished and marks it.
                     log.error("job not stored", job_id=info.job_id, reason=error.reason)
                     break
                 await asyncio.sleep(STORE_RETRY_S)
@@ -614,7 +614,7 @@ class Jobs:
 
 
 async def _next_event(job: _Job, after: int) -> None:
-    """Wait for an event above ``after``, or until no more events follow here."""
+    """Wait for an event with a number above ``after``, or until the job's events end here."""
     async with job.changed:
         await job.changed.wait_for(lambda: job.info.event > after or job.info.over or job.lost)
 

@@ -23,8 +23,8 @@ from .storage.store import Claim, Store, Write
 
 # --- Retention -----------------------------------------------------------------------------------
 
-# Scenarios stay until somebody deletes them. Rows are deleted in small batches with pauses between
-# them, so that a step waits for one batch at most.
+# Scenarios stay until a client deletes them. Rows are deleted in small batches with pauses; a step
+# waits for at most one batch.
 
 DAY_US = 86_400 * 1_000_000
 PIECE_ROWS = 1000
@@ -53,7 +53,7 @@ class Retention:
     """Limits the store of a worker.
 
     Args:
-        store: open during use.
+        store: an open store.
         limits: the limits.
         worker_id: worker whose unused sessions are ended.
     """
@@ -70,7 +70,7 @@ class Retention:
             in_use: open sessions in memory.
 
         Raises:
-            StoreTroubleError: the store fails; the next run deletes the rest.
+            StoreTroubleError: the store fails; the next run continues.
         """
         cutoff_us = now_us() - round(self._limits.session_days * DAY_US)
         await self._end_unused(cutoff_us, in_use)
@@ -151,9 +151,9 @@ class Maintenance:
 
     Args:
         settings: folders and limits.
-        store: open while this runs.
-        jobs: its old jobs are deleted, with their files.
-        sessions: those in memory are not ended.
+        store: an open store.
+        jobs: jobs of the worker; old ones are deleted with their files.
+        sessions: sessions in memory, which are not ended.
     """
 
     def __init__(self, settings: Settings, store: Store, jobs: Jobs, sessions: Sessions) -> None:
@@ -175,7 +175,7 @@ class Maintenance:
             await asyncio.sleep(PERIOD_S)
 
     async def once(self) -> None:
-        """Run all tasks. Raises StoreTroubleError: the store fails."""
+        """Run all tasks. Raises StoreTroubleError if the store fails."""
         await asyncio.to_thread(self.sweep)
         await self._retention.tidy(in_use={session.session_id for session in self._sessions})
         days = self._settings.job_retention_days
@@ -186,13 +186,13 @@ class Maintenance:
         """Remove unfinished files of killed runs.
 
         Args:
-            at_start: nothing of this worker is in progress, so all files in its own folders are
-                abandoned, regardless of age.
+            at_start: whether the worker is starting; all unfinished files in its own folders are
+                then abandoned, regardless of age.
         """
         settings = self._settings
         removed: list[Path] = []
         for folder in (settings.assets_path, settings.scenes_path):
-            # The state folder is ours alone.
+            # No other worker uses the state folder.
             own = folder.resolve().is_relative_to(settings.data_dir.resolve())
             unused_s = 0.0 if own and at_start else OTHERS_UNUSED_S
             removed += sweep_leftovers(folder, unused_s=unused_s, prefix=UPLOADS)

@@ -95,7 +95,7 @@ class Sharing:
         """Fetch an item that another worker has shared; returns whether it exists.
 
         Raises:
-            ServiceError: STORAGE_UNAVAILABLE: the object store fails.
+            ServiceError: STORAGE_UNAVAILABLE if the object store fails.
         """
         row = await self._log.get(kind, name)
         if row is None or row.deleted:
@@ -161,7 +161,7 @@ class Sharing:
                 await self.look()
                 self._in_trouble = False
             except StoreError:
-                pass  # it tells of its trouble itself
+                pass  # the store logs its own errors
             except (ObjectStoreError, OSError) as error:
                 if not self._in_trouble:
                     log.error("store of objects in trouble", reason=str(error))
@@ -189,8 +189,8 @@ class Sharing:
             log.info("bundle shared", kind=kind, name=name, bytes=bundle.bytes)
 
     async def _follow_assets(self) -> None:
-        """Download all assets of the fleet, so that edits need not wait for them, and delete those
-        that were deleted elsewhere."""
+        """Download all assets of the fleet ahead of edits, and delete assets that were deleted
+        elsewhere."""
         rows = [row for (kind, _), row in self._known.items() if kind == "asset"]
         for row in rows:
             if not row.deleted:
@@ -241,7 +241,7 @@ def _unavailable(what: str, error: ObjectStoreError) -> ServiceError:
 
 
 RENEWALS = 4
-"""Renewals per lease duration, so that some may be late."""
+"""Renewals per lease duration; some of them may be late."""
 
 
 class Membership:
@@ -296,7 +296,7 @@ class Membership:
             await self._renew()
 
     async def leave(self) -> None:
-        """Give up the lease: other workers may take the sessions immediately."""
+        """Give up the lease; other workers may take over the sessions immediately."""
         self._left = True
         with contextlib.suppress(StoreError):
             await self._leases.give_up(self._document())
@@ -307,7 +307,7 @@ class Membership:
             try:
                 await self._renew()
             except StoreError:
-                # The store logs its own failures; without it others cannot take over either.
+                # The store logs its own failures. While it fails, others cannot take over either.
                 continue
             except Exception:
                 # Any error: without its lease the worker would lose its sessions.
@@ -360,7 +360,7 @@ class Agent:
 
     Args:
         willingness: returns the worker's readiness; called for each answer.
-        weight: weight of the worker, in percent of the one its proxy configures.
+        weight: weight of the worker, in percent of its weight in the proxy's configuration.
     """
 
     def __init__(self, willingness: Callable[[], Willingness], *, weight: int) -> None:
@@ -388,7 +388,7 @@ class Agent:
             The port.
 
         Raises:
-            OSError: the address is in use, or not of this machine.
+            OSError: the address is in use, or does not belong to this machine.
         """
         server = await asyncio.start_server(self._answer, host, port)
         try:
@@ -408,14 +408,14 @@ class Agent:
 # --- Prewarming ----------------------------------------------------------------------------------
 
 # The proxy sends new sessions to the worker that has their scene, until that worker has 1.5 times
-# as many as the others. The next worker then already has the scene in memory.
+# as many sessions as the others. Prewarming loads the scene on the next worker before that.
 
 LOOK_S = 5.0
 """Interval of checks for the fleet's hot scenes [s]."""
 
 
 class Prewarming:
-    """Loads scenes that are in demand on other workers, if it is this worker's turn.
+    """Loads scenes that are in demand on other workers, when this worker is next in order.
 
     Args:
         leases: list the workers.
@@ -439,7 +439,7 @@ class Prewarming:
             try:
                 await self.look()
             except StoreError:
-                continue  # it tells of its trouble itself
+                continue  # the store logs its own errors
             except ServiceError as error:
                 log.info("scene not loaded ahead", reason=str(error))
 
@@ -447,7 +447,7 @@ class Prewarming:
         """Load the scenes assigned to this worker.
 
         Raises:
-            StoreError: of the database.
+            StoreError: from the database.
             ServiceError: a scene cannot be loaded.
         """
         for scene in loads_of(self._worker_id, await self._leases.workers(), hot=self._hot):
@@ -458,8 +458,8 @@ class Prewarming:
 def loads_of(worker_id: str, workers: Sequence[WorkerRow], *, hot: int) -> list[str]:
     """Hot scenes that only one worker has, and that ``worker_id`` should load.
 
-    All workers compute the same result from the reported statuses: the first of the workers without
-    the scene, in an order that depends on the scene.
+    All workers compute the same result from the reported statuses: the first worker without the
+    scene, in an order that depends on the scene.
     """
     living = {w.worker_id: w.document for w in workers if w.alive and takes_work(w.document)}
     driven: Counter[str] = Counter()

@@ -34,7 +34,7 @@ def check_start(settings: Settings) -> None:
     Raises:
         SceneFolderError: the scene folder is missing.
         StateFolderError: another worker uses the state folder, or it is not writable.
-        AddressError: the address is in use, or not of this machine.
+        AddressError: the address is in use, or does not belong to this machine.
     """
     check_scenes(settings)
     check_state_folder(settings.data_dir)
@@ -57,14 +57,14 @@ def bind(host: str, port: int) -> socket.socket:
     """A socket bound to the address, not yet listening; port 0 uses a free one.
 
     Raises:
-        AddressError: with the address and the remedy.
+        AddressError: the address cannot be used; the message states the remedy.
     """
     try:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
     except OSError as error:
         raise _unusable(host, port, error) from error
-    # Named as TCP, or asyncio would not disable Nagle's algorithm on accepted connections, and
-    # every reply would wait 40 ms for an acknowledgement.
+    # Only for sockets declared as TCP does asyncio disable Nagle's algorithm. With it, every reply
+    # would wait 40 ms for an acknowledgement.
     listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -76,7 +76,7 @@ def bind(host: str, port: int) -> socket.socket:
 
 
 def listen(listener: socket.socket) -> None:
-    """Accept connections on a bound socket. Raises AddressError: it has been taken since."""
+    """Accept connections on a bound socket. Raises AddressError if it has been taken since."""
     host, port = listener.getsockname()[:2]
     try:
         listener.listen(2048)
@@ -128,8 +128,8 @@ _begun: list[subprocess.Popen[bytes]] = []
 
 
 def begin_compiling() -> None:
-    """Start the second process if there are no kernels of an earlier run. Reads no kernel sources:
-    whether the cached ones are valid is checked later."""
+    """Start the second process if no kernels of an earlier run exist. Does not check whether cached
+    kernels are valid."""
     if (os.cpu_count() or 1) > 1 and not _any_on_disk():
         _begun.append(compile_in_background("warm_up"))
 
@@ -142,8 +142,8 @@ def take_begun() -> subprocess.Popen[bytes] | None:
 def compile_in_background(
     function: str, *arguments: str, package: str = "world", niceness: int = 0
 ) -> subprocess.Popen[bytes]:
-    """A process that runs a warm-up of ``package``. Its failure is reported by the later load.
-    It writes a line of two numbers for each kernel: those that are ready, and the total."""
+    """A process that runs a warm-up of ``package``. Failures are reported when kernels are loaded.
+    For each kernel it writes a line with two numbers: ready kernels, and the total."""
     return subprocess.Popen(
         [sys.executable, "-c", _PROGRAM, str(niceness), package, function, *arguments],
         stdin=subprocess.DEVNULL,
@@ -154,7 +154,7 @@ def compile_in_background(
 
 @asynccontextmanager
 async def awaited(process: subprocess.Popen[bytes]) -> AsyncIterator[None]:
-    """A process that runs during the block; its end waits for the process."""
+    """A process that runs during the block; leaving the block waits for it."""
     try:
         yield
         while process.poll() is None:
@@ -181,7 +181,7 @@ class Counter:
         self.done = self.expected = 0
 
     def read(self) -> None:
-        """Read its new output."""
+        """Read the process's new output."""
         with contextlib.suppress(BlockingIOError, ValueError):
             while part := os.read(self._output, 4096):
                 *lines, self._rest = (self._rest + part).split(b"\n")

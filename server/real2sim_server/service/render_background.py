@@ -1,4 +1,4 @@
-"""Background work of the renderer: compiling rarely used kernels and making levels of detail."""
+"""Background work of the renderer: compiles rarely used kernels, creates levels of detail."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from .preflight import awaited, compile_in_background
 log = structlog.get_logger(__name__)
 
 NICENESS = 10
-"""Niceness of the compiling process; the worker keeps rendering meanwhile."""
+"""Niceness of the compiling process; the worker keeps rendering during compilation."""
 
 
 class BackgroundCompile:
@@ -128,10 +128,10 @@ class LensKernels:
 
 
 class DetailLevels:
-    """Makes levels of detail (merged Gaussians for small images) on a background thread.
+    """Creates levels of detail (merged Gaussians for small images) on a background thread.
 
-    Otherwise the engine would make them at the first image, and all sessions would wait. Levels are
-    freed with their clouds.
+    Otherwise the engine would create them at the first image, and all sessions would wait. Levels
+    are freed with their clouds.
 
     Args:
         backend: rendering backend.
@@ -152,7 +152,7 @@ class DetailLevels:
 
     @property
     def held_bytes(self) -> int:
-        """Memory of all levels, including those being made [bytes]."""
+        """Memory of all levels, including unfinished ones [bytes]."""
         return self._reserved + levels_bytes()
 
     def idle(self) -> list[IdleItem]:

@@ -1,4 +1,4 @@
-"""From instances to encoded frames: rendering on the engine, encoding on other threads."""
+"""Renders instances to frames on the engine, and encodes frames on other threads."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class RenderRequest:
         t_us: time, written to the frames [us].
         sensors: cameras, modalities, sizes and codecs.
         rig: rig of the cameras; default: the scene's.
-        twist: [6] of the vehicle, see RigView; for rolling shutters and motion blur.
+        twist: [6] twist of the vehicle, see RigView; for rolling shutters and motion blur.
     """
 
     scene: Scene
@@ -96,10 +96,10 @@ class RenderedFrames:
 class Renderer:
     """Executes render requests.
 
-    Rendering runs on the engine. Encoding runs in parallel on half of the cores: simplejpeg,
-    nvImageCodec and OpenCV release the GIL, so the engine renders the next request meanwhile and
-    the event loop stays free. A 1920x1280 jpeg takes 17 ms on the CPU, a png 170 ms; in both cases
-    the loop's median lag is below 0.2 ms.
+    Rendering runs on the engine. Encoding runs in parallel on half of the cores. simplejpeg,
+    nvImageCodec and OpenCV release the GIL, so the engine can render the next request and the event
+    loop stays free. A 1920x1280 jpeg takes 17 ms on the CPU, a png 170 ms; in both cases the loop's
+    median lag is below 0.2 ms.
 
     Args:
         engine: runs the rendering.
@@ -127,7 +127,7 @@ class Renderer:
         self.jpeg: JpegEncoder = turbo_jpeg
         self._engine = engine
         self._backend = backend
-        # An isinstance check against a protocol takes 20 us, once a step.
+        # An isinstance check against a protocol would take 20 us per step.
         self._draws_together = cache(partial(draws_together, backend))
         self._uses_levels = cache(partial(uses_levels, backend))
         self._metrics = metrics
@@ -149,14 +149,14 @@ class Renderer:
         )
 
     def close(self) -> None:
-        """End its threads."""
+        """End the renderer's threads."""
         self.levels.close()
         self.small_images.close()
         self._encoders.shutdown(cancel_futures=True)
         self._bulk_encoders.shutdown(cancel_futures=True)
 
     async def warm_up(self) -> None:
-        """Render and encode once in every form, so that no first frame is slow."""
+        """Render and encode once in every form, to avoid slow first frames."""
         await self._engine.call(warm_up, self._backend, label="warm-up")
         self.jpeg, why = await asyncio.to_thread(jpeg_encoder_for, device_of(self._backend))
         log.info("jpeg", encoder=why)
@@ -168,7 +168,7 @@ class Renderer:
         Raises:
             ServiceError: UNKNOWN_CAMERA, INVALID_REQUEST for too many pixels or images that the
                 scene lacks, or OUT_OF_MEMORY for levels of detail.
-            QueueFullError, RenderError: as the engine and the rasterizer do.
+            QueueFullError, RenderError: from the engine and the rasterizer.
         """
         rig = request.rig or request.scene.rig
         cameras = check_sensors(rig, request.sensors, max_pixels=self._max_pixels)
@@ -195,11 +195,12 @@ class Renderer:
         cameras: Sequence[Camera],
         things: Callable[[], Sequence[Instance]],
     ) -> None:
-        """Wait until cameras can be rendered without delaying others: for levels of detail, and for
-        kernels of lenses and small images.
+        """Wait for the levels of detail and the kernels of lenses and small images.
+
+        Rendering then does not delay other requests.
 
         Raises:
-            ServiceError: OUT_OF_MEMORY; INVALID_REQUEST where the backend draws no lenses.
+            ServiceError: OUT_OF_MEMORY, or INVALID_REQUEST if the backend does not support lenses.
         """
         if not all(camera.is_pinhole for camera in cameras):
             await self._lenses.ready(cameras)
@@ -213,7 +214,7 @@ class Renderer:
     async def encode(
         self, images: Iterable[RenderedImage], *, priority: Priority = Priority.DRIVE
     ) -> list[EncodedFrame]:
-        """The frames of images, in order, on the encoder threads."""
+        """Encode images on the encoder threads; returns their frames in order."""
         return await self.on_encoders(
             partial(encode_frame, jpeg=self.jpeg), images, priority=priority
         )
@@ -221,14 +222,14 @@ class Renderer:
     async def on_encoders(
         self, fn: Callable[[T], R], items: Iterable[T], *, priority: Priority = Priority.DRIVE
     ) -> list[R]:
-        """``fn`` of each item, in order, on the encoder threads."""
+        """Map ``fn`` over items on the encoder threads; returns the results in order."""
         loop = asyncio.get_running_loop()
         encoders = self._bulk_encoders if priority is Priority.BULK else self._encoders
         work = [loop.run_in_executor(encoders, fn, item) for item in items]
         try:
             return await asyncio.gather(*work)
         except Exception as error:
-            # Images that were still being copied from the device.
+            # These images were still being copied from the device.
             self._engine.note_error(error)
             raise
 
@@ -239,7 +240,7 @@ class Renderer:
         *,
         between: Callable[[], object] | None = None,
     ) -> tuple[list[RenderedImage], float]:
-        """Images of all sensors, and the milliseconds it took; on the engine thread.
+        """Render all sensors on the engine thread; returns the images and the duration [ms].
 
         ``between`` is called between pieces of the work.
         """
@@ -266,15 +267,16 @@ class Renderer:
         *,
         between: Callable[[], object] | None = None,
     ) -> list[list[RenderedImage]]:
-        """Images of all sensors of each request, batched where one pass can render them. On the
-        engine thread, which continues while they are copied from the device.
+        """Images of all sensors of each request, batched if one pass can render them.
+
+        Runs on the engine thread, which continues while images are copied from the device.
 
         Args:
             requests: each with the cameras of its sensors, in order.
             between: called between parts of the work.
 
         Raises:
-            RenderError: of any of them.
+            RenderError: from any request.
         """
         passes = _passes([request for request, _ in requests])
         images: list[dict[int, list[RenderedImage]]] = [{} for _ in requests]
@@ -303,7 +305,7 @@ class Renderer:
     def _image(
         self, request: RenderRequest, sensor: SensorSpec, camera: Camera, frame: Frame, name: str
     ) -> RenderedImage:
-        """One image of a sensor, with its effects."""
+        """One image of a sensor, with the sensor's effects."""
         image = RenderedImage(
             sensor,
             name,
@@ -345,7 +347,7 @@ class Renderer:
 
 
 def encoder_threads() -> int:
-    """Images that are encoded in parallel: half of the cores, at least two."""
+    """Number of images that are encoded in parallel: half of the cores, at least two."""
     affinity = getattr(os, "sched_getaffinity", None)
     cores = len(affinity(0)) if affinity is not None else os.cpu_count() or 1
     return max(2, min(MAX_ENCODERS, cores // 2))
@@ -418,10 +420,10 @@ def _samples() -> Iterator[RenderedImage]:
 
 
 def check_known(scene: Scene, sensors: Iterable[SensorSpec]) -> None:
-    """Refuse images that the scene's data cannot provide.
+    """Refuse images that the scene cannot provide.
 
     Raises:
-        ServiceError: INVALID_REQUEST, uncertainty of a scene that has none.
+        ServiceError: INVALID_REQUEST for uncertainty, if the scene has none.
     """
     asked = any(UNCERTAINTY in sensor.modalities for sensor in sensors)
     if asked and not scene.has_uncertainties:
@@ -488,7 +490,8 @@ def choose_media_type(accept: str | None, modality: Modality) -> str:
     """The media type that the client prefers (RFC 9110, section 12.5.1).
 
     Raises:
-        ServiceError: NOT_ACCEPTABLE if there is none; depth and instance are never jpeg.
+        ServiceError: NOT_ACCEPTABLE if the client accepts none of them; depth and instance are
+            never jpeg.
     """
     codecs = modality_of(modality).codecs
     offered = [media_type for media_type, codec in CODEC_OF.items() if codec in codecs]
@@ -499,14 +502,14 @@ MSGPACK = "application/msgpack"
 
 
 def choose_frames_type(accept: str | None, modalities: Sequence[Modality]) -> str:
-    """The same for images of these modalities: msgpack, or for one image any of its formats."""
+    """The media type for images of these modalities: msgpack, or an image format for one image."""
     if len(modalities) == 1:
         return choose_media_type(accept, modalities[0])
     return choose_among([MSGPACK], accept, of="more than one image")
 
 
 def frames_response(rendered: RenderedFrames, media_type: str, *, t_us: int) -> Response:
-    """The response with all frames of one time; a single frame also as an image file."""
+    """The response with all frames of one time; a single frame can also be an image file."""
     if media_type != MSGPACK:
         return frame_response(rendered, media_type)
     view = {"t_us": t_us, "frames": [frame.fields for frame in rendered.frames]}

@@ -64,7 +64,7 @@ from .library.scenes import SceneCache
 from .scenarios import Scenarios
 
 NEARBY_DISTANCE = 25.0
-"""Objects within this distance of a moving one take part [m], up to ``MAX_NEARBY_OBJECTS``."""
+"""Objects this close to a moving one are simulated too [m], up to ``MAX_NEARBY_OBJECTS``."""
 
 MAX_NEARBY_OBJECTS = 12
 PLAYBACK = "playback.json"
@@ -75,7 +75,7 @@ class RolloutPlan:
     """A rollout, ready to start.
 
     Attributes:
-        scene: the scene with erased regions hidden and inserted assets added.
+        scene: scene without erased regions and with inserted assets.
         state: state of the scenario; ``resolved_objects`` are its objects as in ``scene``.
         options: options of the physics.
     """
@@ -178,7 +178,7 @@ def _with_values(
     """Physics values of the objects, with some replaced.
 
     Raises:
-        ServiceError: UNKNOWN_OBJECT for values of an object that does not take part.
+        ServiceError: UNKNOWN_OBJECT for values of an object that is not simulated.
     """
     unknown = [name for name in values if name != "*" and name not in objects]
     if unknown:
@@ -377,7 +377,7 @@ def _physics(subject: ObjectState, start: int) -> ObjectPhysics:
 
 
 def colliders_of(state: ScenarioState) -> list[Collider]:
-    """Rigid colliders: the scenario's, and the scene's ground unless one of them is a ground."""
+    """The scenario's rigid colliders, and the scene's ground if the scenario has no ground."""
     colliders: list[Collider] = []
     grounds = [c for c in state.standing_colliders if isinstance(c.shape, GroundShape)]
     if not grounds:
@@ -400,7 +400,7 @@ def _collider(state: ScenarioState, given: AddCollider) -> Collider:
 def _solid(
     shape: BoxShape | CylinderShape | CapsuleShape | MeshShape,
 ) -> tuple[type[Solid], dict[str, Any]]:
-    """The solid of a shape, with its members."""
+    """The solid of a shape, with the shape's parameters."""
     match shape:
         case BoxShape():
             return Box, {"size": shape.size}
@@ -448,7 +448,7 @@ class Simulations:
 
         Raises:
             ServiceError: as for scenarios, scene cache and jobs; INVALID_REQUEST, UNKNOWN_OBJECT or
-                TIME_OUT_OF_RANGE if it cannot be simulated.
+                TIME_OUT_OF_RANGE if the request cannot be simulated.
         """
         revision = (await self._scenarios.view(scenario_id)).revision
         work = await self._work(scenario_id, revision, request)
@@ -501,7 +501,7 @@ class Simulations:
         scene, playback = cached
 
         def instances(t_us: int, *, aboard: bool = True) -> Sequence[Instance]:
-            # It caches the last deformed clouds, which is not thread-safe.
+            # The replay caches the last deformed clouds and is not thread-safe.
             with self._drawing:
                 return playback.instances(t_us, aboard=aboard)
 
@@ -549,7 +549,7 @@ class Calibrations:
         """Start a calibration on the scenario's current revision.
 
         Raises:
-            ServiceError: as for a simulation; UNKNOWN_OBJECT for an object that does not take part.
+            ServiceError: as for a simulation; UNKNOWN_OBJECT for an object that is not simulated.
             PhysicsError: observations that do not fit the simulation.
         """
         view = await self._scenarios.view(scenario_id)
@@ -601,7 +601,7 @@ def _run(
     progress: Callable[[float], None],
     cancelled: Callable[[], bool],
 ) -> ObjectCalibration:
-    # Gradients at the start, once in between, and at the end; steps; and coarser cells.
+    # Gradients at the start, in the middle and at the end; search steps; coarser cells.
     expected = 6 * len(request.parameters) + 2 * request.steps + 5
     try:
         return calibrate_object(

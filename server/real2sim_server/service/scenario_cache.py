@@ -187,7 +187,7 @@ def stale_revision(scenario: Scenario, expected: int) -> ServiceError:
 
 
 def changed_elsewhere(scenario_id: str) -> ServiceError:
-    """The refusal of a change after another worker's faster one."""
+    """The refusal of a change because another worker's change was faster."""
     return ServiceError(
         ErrorCode.STALE_REVISION,
         f"another worker has changed scenario {scenario_id!r}",
@@ -243,7 +243,8 @@ log = structlog.get_logger(__name__)
 class Snapshots:
     """Snapshots of all scenarios of a worker, for use on the event loop.
 
-    They are optional: written after the reply, never waited for, and ignored if invalid.
+    Snapshots are optional: they are written after the reply, in the background, and ignored if
+    invalid.
     """
 
     def __init__(self, store: Store) -> None:
@@ -255,8 +256,7 @@ class Snapshots:
     async def load(
         self, row: ScenarioRow, summary: SceneSummary, assets: AssetLookup | None
     ) -> Scenario:
-        """Load a scenario from its log, which is authoritative, and from a snapshot if there is
-        one."""
+        """Load a scenario from its snapshot, if any, and its log, which is authoritative."""
         stored = await self._store.scenario_entries(row.scenario_id)
         initial = await asyncio.to_thread(ScenarioState.of, summary, assets=assets)
         known = await self._read(row.scenario_id, initial, revisions=len(stored))
@@ -309,7 +309,7 @@ class Snapshots:
             row = SnapshotRow(scenario_id, revision, self._made_by, packed)
             await self._store.save_snapshot(row)
         except (StoreError, SQLAlchemyError, RuntimeError) as error:
-            # Deleted meanwhile, or the worker is stopping; the log is sufficient.
+            # The scenario was deleted, or the worker is stopping; the log is sufficient.
             log.info("snapshot not kept", scenario_id=scenario_id, reason=str(error))
 
 
@@ -356,9 +356,9 @@ class CachedScenario:
     """A scenario in memory.
 
     Attributes:
-        row: replaced when its name changes.
-        scenario: replaced, under the lock, when others have extended its log.
-        lock: serializes edits; readers need none, because states are immutable.
+        row: row of the scenario; replaced when its name changes.
+        scenario: current scenario; replaced, under the lock, when others have extended its log.
+        lock: serializes edits; readers need no lock, because states are immutable.
     """
 
     row: ScenarioRow
@@ -385,7 +385,7 @@ class ScenarioCache:
         self._opening: dict[str, asyncio.Lock] = {}
 
     def evict(self, scenario_id: str) -> None:
-        """Drop it from the cache; the next request reads it from the store."""
+        """Drop a scenario from the cache; the next request reads it from the store."""
         self._cached.pop(scenario_id, None)
 
     async def wait_for_changes(self) -> None:
@@ -396,22 +396,22 @@ class ScenarioCache:
 
     @asynccontextmanager
     async def locked(self, scenario_id: str) -> AsyncIterator[CachedScenario]:
-        """The scenario, locked against other changes.
+        """Lock a scenario against other changes during the block.
 
         Raises:
-            ServiceError: as :meth:`get`, or INVALID_OPERATION for a recording.
+            ServiceError: see :meth:`get`; also INVALID_OPERATION for a recording.
         """
         check_made(scenario_id)
         while True:
             cached = await self.get(scenario_id)
             async with cached.lock:
-                # The previous holder of the lock may have evicted or deleted it.
+                # The previous holder of the lock may have evicted or deleted the scenario.
                 if self._cached.get(scenario_id) is cached:
                     yield cached
                     return
 
     async def get(self, scenario_id: str) -> CachedScenario:
-        """The scenario with all entries of its log, by any worker; a recorded scene has no log.
+        """The scenario with all log entries of all workers; a recorded scene has no log.
 
         Raises:
             ServiceError: UNKNOWN_SCENARIO, or SCENE_BROKEN if its scene has changed.
@@ -469,7 +469,7 @@ class ScenarioCache:
             self.evict(scenario_id)
             return False
         if stored > cached.scenario.revision:
-            # Our own changes take effect before their lock is released.
+            # This worker's own changes take effect before their lock is released.
             async with cached.lock:
                 await self._catch_up(scenario_id, cached)
         if self._cached.get(scenario_id) is not cached:
@@ -501,7 +501,7 @@ class ScenarioCache:
         return CachedScenario(row, scenario, summary)
 
     def put(self, cached: CachedScenario) -> None:
-        """Add a scenario and evict the least recently used, unless they are being edited."""
+        """Add a scenario and evict the least recently used ones that are not being edited."""
         self._cached[cached.row.scenario_id] = cached
         if len(self._cached) > MAX_CACHED_SCENARIOS:
             for key in [k for k, h in self._cached.items() if not h.lock.locked()][

@@ -75,17 +75,17 @@ class Scenarios:
     async def create(
         self, request: ScenarioCreate, *, idempotent: IdempotentRequest
     ) -> ScenarioInfo:
-        """A new scenario, stored. Raises ServiceError: UNKNOWN_SCENE or SCENE_BROKEN."""
+        """Create and store a scenario. Raises ServiceError: UNKNOWN_SCENE or SCENE_BROKEN."""
         summary = await self._scene_cache.summary(request.scene)
         return await self._create(request.name, request.scene, summary, [], idempotent=idempotent)
 
     async def fork(
         self, scenario_id: str, request: ScenarioFork, *, idempotent: IdempotentRequest
     ) -> ScenarioInfo:
-        """A new scenario with the same history, up to a revision.
+        """Create a scenario with the same history, up to a revision.
 
         Raises:
-            ServiceError: UNKNOWN_SCENARIO, or INVALID_REQUEST for a revision that is not there.
+            ServiceError: UNKNOWN_SCENARIO, or INVALID_REQUEST for a missing revision.
         """
         cached = await self._scenarios_cache.get(scenario_id)
         entries = list(cached.scenario.entries)
@@ -117,7 +117,7 @@ class Scenarios:
     async def import_(
         self, document: ScenarioDocument, *, idempotent: IdempotentRequest
     ) -> ScenarioInfo:
-        """Create a scenario from a file, on the scene with its hash.
+        """Create a scenario from a file, on the scene with the file's scene hash.
 
         Raises:
             ServiceError: UNKNOWN_SCENE or UNKNOWN_ASSET if the file refers to missing ones;
@@ -213,8 +213,8 @@ class Scenarios:
 
         Args:
             scenario_id: the scenario.
-            operations: in order.
-            expected: revision they are based on; None for any.
+            operations: operations, in order.
+            expected: revision that they are based on; None for any.
             dry_run: validate and reply without changes.
             idempotent: stores the reply.
             who: name for the history.
@@ -243,7 +243,7 @@ class Scenarios:
         idempotent: IdempotentRequest,
         who: str = "",
     ) -> OperationResult:
-        """Undo the last edit in effect. Raises as :meth:`edit`, or NOTHING_TO_UNDO."""
+        """Undo the last edit in effect. Raises like :meth:`edit`; also NOTHING_TO_UNDO."""
         result = await self._change(
             scenario_id, lambda s: s.plan_undo(who=who), expected, idempotent=idempotent
         )
@@ -258,7 +258,7 @@ class Scenarios:
         idempotent: IdempotentRequest,
         who: str = "",
     ) -> OperationResult:
-        """Redo the last undone edit. Raises as :meth:`edit`, or NOTHING_TO_REDO."""
+        """Redo the last undone edit. Raises like :meth:`edit`; also NOTHING_TO_REDO."""
         result = await self._change(
             scenario_id, lambda s: s.plan_redo(who=who), expected, idempotent=idempotent
         )
@@ -330,7 +330,7 @@ class Scenarios:
         dry_run: bool,
         idempotent: IdempotentRequest,
     ) -> OperationResult:
-        """A change on top of the newest revision. Raises ConflictError: there is a newer one."""
+        """Store a change based on the newest revision. Raises ConflictError if it is outdated."""
         async with self._scenarios_cache.locked(scenario_id) as cached:
             scenario = cached.scenario
             if expected is not None and expected != scenario.revision:
@@ -338,7 +338,7 @@ class Scenarios:
                 raise stale_revision(scenario, expected)
 
             def change() -> tuple[PlannedEntry, OperationResult]:
-                # Overlap checks of large batches take milliseconds; they need no device.
+                # Overlap checks of large batches take milliseconds and need no device.
                 planned = plan(scenario)
                 revision = scenario.revision if dry_run else planned.entry.revision
                 result = operation_result(planned, revision=revision, dry_run=dry_run)

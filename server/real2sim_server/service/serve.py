@@ -34,7 +34,7 @@ from .worker import Worker
 # --- Garbage collection --------------------------------------------------------------------------
 
 # A full collection takes 0.2 s and blocks all sessions. The default thresholds trigger one every
-# few thousand steps, although nearly all objects exist before the first step and stay.
+# few thousand steps, although nearly all objects are created before the first step and never freed.
 
 YOUNG = 20_000
 """New objects between two young collections; a step creates about 200, nearly all freed by
@@ -42,13 +42,13 @@ reference counting."""
 
 
 def collect_rarely() -> None:
-    """Raise the thresholds, so that collections are many steps apart."""
+    """Raise the thresholds, to keep collections many steps apart."""
     gc.set_threshold(YOUNG, *gc.get_threshold()[1:])
 
 
 def freeze_objects() -> None:
-    """Exclude all current objects from collections. Call once, when a worker has started: current
-    objects that become cyclic garbage are never freed."""
+    """Exclude all current objects from collections. Call it once, after a worker has started:
+    current objects that become cyclic garbage are never freed."""
     gc.collect(1)
     gc.freeze()
 
@@ -96,7 +96,7 @@ def configure_logging(*, level: str = "info", log_format: str = "auto") -> None:
     root = logging.getLogger()
     root.handlers = [handler]
     root.setLevel(level.upper())
-    # We log one line per request; the server's access log would duplicate it.
+    # The worker logs one line per request; the server's access log would duplicate it.
     logging.getLogger("uvicorn.access").disabled = True
     for name in ("uvicorn", "uvicorn.error", "asyncio", "alembic"):
         logging.getLogger(name).setLevel(max(logging.WARNING, root.level))
@@ -106,8 +106,8 @@ PING_INTERVAL_S = 10.0
 PING_TIMEOUT_S = 20.0
 POLL_S = 0.02
 LINGER_S = 1.5
-"""Time for which a worker that has handed over its sessions tells clients so, until its proxy has
-noticed [s]."""
+"""Time for which a worker that has handed over its sessions still answers clients, until its proxy
+has noticed [s]."""
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ def run(settings: Settings) -> int:
     Raises:
         OpenBindError: an address other than loopback, without a token.
         SceneFolderError: the scene folder is missing.
-        AddressError: the address is in use, or not of this machine.
+        AddressError: the address is in use, or does not belong to this machine.
         RenderError: the backend of the settings is not available here.
         StateFolderError: another worker uses the state folder, or it is not writable.
         StoreError: the store cannot be opened.
@@ -145,11 +145,11 @@ def run(settings: Settings) -> int:
     worker: Worker = app.state.worker
     print(_announcement(worker, url_of(settings.host, listener)), file=sys.stderr, flush=True)
     server = DrainingServer(server_config(app, settings), worker)
-    # A lost device makes the process unusable: it ends, and its supervisor starts a new one.
+    # A lost device makes the process unusable. It exits, and its supervisor starts a new one.
     worker.engine.on_failure = lambda: setattr(server, "should_exit", True)
     collect_rarely()
     worker.on_ready = freeze_objects
-    # The server stops gracefully at a signal and then raises it again for us.
+    # The server stops gracefully at a signal and then raises the signal again.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     with contextlib.suppress(KeyboardInterrupt), _start_errors_logged_once(worker):
         server.run(sockets=[listener])
@@ -169,8 +169,8 @@ def running_worker(settings: Settings, *, timeout_s: float = 120.0) -> Iterator[
     Raises:
         OpenBindError: an address other than loopback, without a token.
         SceneFolderError: the scene folder is missing.
-        AddressError: the address is in use, or not of this machine.
-        RuntimeError: it ended, or was not ready in time; with its reasons.
+        AddressError: the address is in use, or does not belong to this machine.
+        RuntimeError: the worker ended or was not ready in time; the message gives the reasons.
     """
     check_bind(settings.host, settings.needs_token)
     check_scenes(settings)
@@ -207,7 +207,7 @@ def _start_errors_logged_once(worker: Worker) -> Iterator[None]:
     try:
         yield
     except SystemExit:
-        # How uvicorn reports that it has not started.
+        # uvicorn raises this if it has not started.
         if worker.start_error is None:
             raise
     finally:
@@ -215,12 +215,12 @@ def _start_errors_logged_once(worker: Worker) -> Iterator[None]:
 
 
 class DrainingServer(uvicorn.Server):
-    """uvicorn's server; after SIGTERM it continues to serve for a while, not ready, before it
-    stops.
+    """uvicorn's server, which drains the worker after SIGTERM: it reports not ready, continues to
+    serve for a limited time, then stops.
 
     Args:
         config: config of the server.
-        worker: drains; its settings limit the duration.
+        worker: the worker; its settings limit the duration.
     """
 
     def __init__(self, config: uvicorn.Config, worker: Worker) -> None:
@@ -247,7 +247,7 @@ class DrainingServer(uvicorn.Server):
         return await super().on_tick(counter)
 
     async def _handed_over(self) -> bool:
-        """Whether other workers have taken over this one's sessions."""
+        """Whether other workers have taken over this worker's sessions."""
         try:
             return await self._worker.hand_over()
         except StoreError:
@@ -264,7 +264,7 @@ def server_config(app: FastAPI, settings: Settings) -> uvicorn.Config:
         server_header=False,
         lifespan="on",
         ws="websockets-sansio",
-        # Deflating a frame takes 20 ms for nothing: images do not compress.
+        # Compressing a frame would take 20 ms without effect: images do not compress.
         ws_per_message_deflate=False,
         ws_max_size=MAX_CLIENT_MESSAGE_BYTES,
         ws_ping_interval=PING_INTERVAL_S,
@@ -298,7 +298,7 @@ def _wait_until_ready(
         if not thread.is_alive():
             reason = worker.start_error or "see its log"
             raise RuntimeError(f"the worker ended while it started: {reason}")
-        # Short, because a dead worker leaves the connection open without data.
+        # A short timeout, because a dead worker leaves the connection open without data.
         ready, answer = _ask_readiness(address, timeout_s=0.5)
         if ready:
             return

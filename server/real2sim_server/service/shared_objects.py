@@ -37,15 +37,15 @@ if TYPE_CHECKING:
 
 DIGEST = re.compile(r"[0-9a-f]{64}")
 FRESH_S = 12 * 3600.0
-"""Age from which an object is written again when it is put, to renew its age [s]."""
+"""Age above which a put writes the object again, to renew its age [s]."""
 RETRIES = 3
-"""Retries of a request that timed out, or that a busy store refused."""
+"""Number of retries of a request that timed out or that a busy store refused."""
 PIECE_BYTES = 4 << 20
 """Size of one read from a store [bytes]."""
 
 
 class ObjectStoreError(Exception):
-    """The object store fails, or does not have the object; the call had no effect."""
+    """The object store fails or does not have the object; the call had no effect."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class ObjectStore(Protocol):
         """All objects, in any order."""
 
     def remove(self, digest: str) -> None:
-        """Delete an object; no effect if there is none."""
+        """Delete an object; no effect if it does not exist."""
 
 
 def open_objects(url: str) -> ObjectStore:
@@ -117,7 +117,7 @@ class FolderObjects:
     """Objects as files of a folder, shared by workers on one machine or file system.
 
     Args:
-        folder: folder of the objects; created with the first.
+        folder: folder of the objects; created with the first object.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -270,7 +270,7 @@ class S3Objects:
 
 
 class _refusals:
-    """Convert errors of the client; a missing object keeps its error."""
+    """Convert errors of the client, except for missing objects."""
 
     def __enter__(self) -> None:
         return None
@@ -437,7 +437,7 @@ class BundleFolders:
         return target
 
     def sweep(self, wanted: set[str]) -> int:
-        """Delete objects that no bundle uses and that nobody has put for a day; returns their
+        """Delete objects that no bundle uses and that were not put for a day; returns their
         number.
 
         Args:
@@ -471,7 +471,7 @@ class BundleFolders:
         for path in sorted(taken, key=lambda p: (p / MARK).stat().st_mtime):
             if held + more <= self._max_bytes:
                 return
-            # Processes with open or mapped files keep them.
+            # Deleted files stay available to processes that have them open or mapped.
             shutil.rmtree(path, ignore_errors=True)
             held -= sizes[path]
             log.info("bundle dropped", folder=path.name, bytes=sizes[path])
@@ -490,7 +490,7 @@ class BundleFolders:
 
 
 def mark_used(folder: Path) -> None:
-    """Mark a bundle as used, so that others are deleted first."""
+    """Mark a bundle as recently used; less recently used ones are deleted first."""
     with contextlib.suppress(FileNotFoundError):
         os.utime(folder / MARK)
 
@@ -533,7 +533,7 @@ class BundleRow:
 
     @property
     def deleted(self) -> bool:
-        """Whether it was deleted: workers delete their copies."""
+        """Whether the bundle was deleted; workers then delete their copies."""
         return not self.content
 
 
@@ -541,14 +541,14 @@ class BundleLog:
     """The list of shared bundles.
 
     Args:
-        store: open while this is used.
+        store: an open store.
     """
 
     def __init__(self, store: Store) -> None:
         self._store = store
 
     async def add(self, row: BundleRow) -> bool:
-        """Add a bundle; False if there is one of that name, which is not changed."""
+        """Add a bundle. Returns False, without changes, if the name exists."""
         values = vars(row) | {"created_us": now_us()}
         with contextlib.suppress(ConflictError):
             await self._store.write(Write(sa.insert(t.shared_bundles), [values]), *self._notice())
@@ -559,7 +559,7 @@ class BundleLog:
         return counts[0] > 0
 
     async def get(self, kind: str, name: str) -> BundleRow | None:
-        """The bundle of that name."""
+        """The bundle with that name."""
         rows = await self._rows(self._is(kind, name))
         return rows[0] if rows else None
 

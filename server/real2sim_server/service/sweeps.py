@@ -181,7 +181,7 @@ class Sweeps:
     """Starts sweeps and searches, for use on the event loop.
 
     Each is a separate process that simulates worlds directly, at a lower priority than the engine.
-    Its episodes are stored as they finish, so that a restarted worker resumes it.
+    Episodes are stored as they finish, and a restarted worker resumes the job.
     """
 
     def __init__(self, jobs: Jobs, scene_cache: SceneCache) -> None:
@@ -272,7 +272,7 @@ class _Telling:
         self._begun: tuple[str, int, float] = ("", 0, 0.0)
 
     def __call__(self, told: Any) -> None:
-        """Args: told, a line of the command, None before the first. Raises JobCancelled."""
+        """Report a line of the command; None before the first line. Raises JobCancelled."""
         if told is None:
             return
         stage, done, total = str(told["stage"]), int(told["done"]), max(int(told["total"]), 1)

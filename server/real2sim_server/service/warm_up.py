@@ -32,10 +32,10 @@ log = structlog.get_logger(__name__)
 
 
 class KernelWarmUp:
-    """Prepares the kernels of one worker, beginning with those that every session needs.
+    """Prepares the kernels of one worker, starting with those that every session needs.
 
-    On the first run a second process compiles in parallel; this one then loads the cached kernels
-    from disk, see :mod:`.preflight`.
+    On the first run, a second process compiles in parallel, and this process then loads the cached
+    kernels from disk, see :mod:`.preflight`.
     """
 
     def __init__(self) -> None:
@@ -94,7 +94,7 @@ class KernelWarmUp:
             with _no_collections():
                 async with awaited(process):
                     await warm_up_renderer()
-            # These are on disk if the other process has succeeded.
+            # These kernels are on disk if the other process has succeeded.
             self._beside, self._compiled = None, process.returncode == 0
         else:
             await warm_up_renderer()
@@ -113,9 +113,10 @@ class KernelWarmUp:
 
 
 class DeformationKernels:
-    """Kernels for images after impacts. They take as long as all others, and few sessions have an
-    impact. They are therefore prepared in the background from the first episode that may have one;
-    only images that need them wait. For use on the event loop.
+    """Kernels for images after impacts, for use on the event loop.
+
+    They take as long to compile as all others, and few sessions have an impact. The first episode
+    that may have one starts their preparation in the background. Only images that need them wait.
 
     Attributes:
         ready: whether images after impacts can be rendered; read on any thread.

@@ -69,7 +69,7 @@ class Worker:
         waiting_for: pending steps before the worker is ready.
         draining: whether the worker is shutting down.
         handed_over: whether other workers have its sessions and jobs.
-        start_error: why it did not start.
+        start_error: reason why it did not start.
         on_ready: called on the event loop when startup is complete.
     """
 
@@ -222,7 +222,7 @@ class Worker:
             at_exit.push_async_callback(_cancel, asyncio.create_task(self.store.watch()))
             at_exit.push_async_callback(self.scenarios.flush)
             maintenance = Maintenance(self.settings, self.store, self.jobs, self.sessions)
-            # No uploads yet: existing temporary files are abandoned.
+            # No uploads can be in progress yet: existing temporary files are abandoned.
             await asyncio.to_thread(partial(maintenance.sweep, at_start=True))
             if self.settings.demo:
                 await asyncio.to_thread(self._add_demo)
@@ -343,7 +343,7 @@ class Worker:
             yield
 
     def _share(self, job_log: JobLog) -> None:
-        """Connect to the object store, if there is one."""
+        """Connect to the object store, if one is configured."""
         settings = self.settings
         if settings.objects_url is None:
             return
@@ -368,8 +368,9 @@ class Worker:
         self.jobs.on_forget = partial(self.sharing.forget, "job")
 
     async def hand_over(self) -> bool:
-        """Hand over sessions and jobs to other workers. False if none would accept them: they
-        continue when this one is back.
+        """Hand over sessions and jobs to other workers.
+
+        Returns False if no other worker accepts them; they then continue when this worker is back.
 
         Raises:
             StoreError: from the database; nothing was handed over.
@@ -388,7 +389,7 @@ class Worker:
         return True
 
     def _add_demo(self) -> None:
-        """Import the demo street, unless a scene of its name exists."""
+        """Import the demo street, unless a scene with its name exists."""
         try:
             import_scene(
                 SHIPPED_STREET,
@@ -434,7 +435,7 @@ class Worker:
         }
 
     def _held(self) -> dict[str, list[int]]:
-        """Sessions and unfinished jobs by name of their owner."""
+        """Numbers of sessions and unfinished jobs by owner name."""
         sessions, jobs = self.sessions.owned(), self.jobs.unfinished()
         return {
             name: [sessions[name], jobs[name]] for name in sorted(sessions.keys() | jobs.keys())
@@ -535,11 +536,11 @@ def _device_info(backend: Backend, settings: Settings) -> DeviceInfo:
     )
 
 
-# Async: FastAPI runs plain functions on threads, and each switch costs more than the work.
+# Async, because FastAPI runs plain functions on threads, and a thread switch takes longer.
 async def _worker_of(connection: HTTPConnection) -> Worker:
     worker: Worker = connection.app.state.worker
     return worker
 
 
 WorkerOf = Annotated[Worker, Depends(_worker_of)]
-"""The worker, as a parameter of routes and sockets."""
+"""Parameter of routes and sockets that receives the worker."""

@@ -60,7 +60,7 @@ WHEELS_SLEEP_TIME = 0.2
 
 
 class BodyMode(IntEnum):
-    """How a body moves."""
+    """The motion mode of a body."""
 
     SLEEPING = 0
     RIGID = 1
@@ -99,7 +99,8 @@ class DeformableBody:
         shape: shape after earlier deformation, or None.
 
     Attributes:
-        acceleration: [3] of the centre of mass in the last deforming step; else zero [m/s^2].
+        acceleration: [3] acceleration of the centre of mass in the last deforming step [m/s^2];
+            zero in other modes.
     """
 
     def __init__(
@@ -188,7 +189,7 @@ class DeformableBody:
         return (self.state.positions - pose[:3, 3]) @ pose[:3, :3]
 
     def hull_points(self) -> Float:
-        """[K, 3] its outermost particles, world frame [m]; used against half-spaces."""
+        """[K, 3] outermost particles, world frame [m]; used for contact with half-spaces."""
         return self._world(self._hull, 0)
 
     def shell_points(self) -> Float:
@@ -266,7 +267,7 @@ class DeformableBody:
 
     @property
     def _local_centre(self) -> Float:
-        """[3] its centre of mass in its own frame, in its current shape [m]."""
+        """[3] centre of mass in the current shape, body frame [m]."""
         if self._centre_of is not self.shape:
             self._centre_of = self.shape
             self._centre: Float = self.rest.masses @ self.shape.positions / self.rest.mass
@@ -274,7 +275,7 @@ class DeformableBody:
 
     @property
     def reach(self) -> float:
-        """Radius of its bounding sphere around the centre of mass [m]."""
+        """Radius of the bounding sphere around the centre of mass [m]."""
         positions = self.shape.positions if self.state is None else self.state.positions
         if self._radius_of is not positions:
             centre = self.rest.masses @ positions / self.rest.mass
@@ -331,7 +332,7 @@ class DeformableBody:
 
     @property
     def elastic_energy(self) -> float:
-        """Energy stored in its deformation [J]."""
+        """Elastic energy of the deformation [J]."""
         return self._stored_energy if self.state is None else self.state.elastic
 
     def advance_rigid(
@@ -492,17 +493,17 @@ class DeformableBody:
 
     @property
     def is_undamped(self) -> bool:
-        """Whether it is purely elastic, without any dissipation."""
+        """Whether the body is purely elastic, without any dissipation."""
         return all(m.viscosity == 0 and not m.plastic for m in self.materials)
 
     @property
     def may_rigidify(self) -> bool:
-        """Whether it has been deforming and settled for long enough."""
+        """Whether the body has been deforming and settled for long enough."""
         return self._settle_time >= SETTLE_TIME and self._deforming_time >= 2 * SETTLE_TIME
 
     @property
     def may_sleep(self) -> bool:
-        """Whether it has also been nearly still for long enough."""
+        """Whether the body has also been nearly still for long enough."""
         return self.may_rigidify and self._sleep_time > SLEEP_TIME
 
     def rigidify(self) -> None:

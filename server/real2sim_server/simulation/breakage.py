@@ -29,7 +29,7 @@ LAMP_HEIGHT, LAMP_WIDTH = (0.52, 0.9), 0.32
 BUMPER_HEIGHT = (0.18, 0.52)
 """Height of bumpers above the road [m]."""
 TALL = 1.9
-"""Height from which on a vehicle is a van or lorry, with higher belt and bumpers [m]."""
+"""Minimum height of a van or lorry, with higher belt line and bumpers [m]."""
 BELT, BELT_TALL = 0.6, 0.5
 """Height of the belt line, where glass begins, as a fraction of the vehicle's height."""
 COWL, UNDER_ROOF = 0.05, 0.94
@@ -156,7 +156,7 @@ LIMITS: dict[Kind, float] = {"lamp": 0.05, "bumper": 0.08, "windscreen": 0.03, "
 Glass: root mean square racking of its frame. Laminated screens crack first; side windows break with
 their door."""
 OUTER = 0.75
-"""Quantile of the inward displacement that counts: half the material around a lamp is behind it."""
+"""Quantile of the inward displacement to use: half the material around a lamp is behind it."""
 MIN_PARTICLES = 3
 NEAR = 0.6
 """Maximum distance from a part's box of the particles that carry it [spacings]."""
@@ -185,7 +185,7 @@ class Breakage:
     severity: float
 
     def record(self) -> dict[str, Any]:
-        """As JSON values."""
+        """The breakage as JSON values."""
         return asdict(self)
 
     @classmethod
@@ -303,7 +303,7 @@ SHARDS: dict[Kind, _Shards] = {
 def fragment_cloud(
     broken: Sequence[Breakage], time_s: float, heights: Heights
 ) -> GaussianCloud | None:
-    """All fragments at ``time_s`` [s], world frame; None if there are none.
+    """All fragments at ``time_s`` [s], world frame, or None.
 
     Args:
         broken: broken parts.
@@ -414,18 +414,17 @@ def _tensor(values: NDArray[np.float64]) -> torch.Tensor:
 
 
 # The underside of a vehicle that turns over. Recordings do not show it. Training fits the contact
-# shadow between wheels and road instead, and it would look like a ragged plate on an overturned
+# shadow between wheels and road instead, which would look like a ragged plate on an overturned
 # vehicle.
 
 SHADOW, SILLS = 0.1, 0.3
-"""Gaussians below the sills that reach down to this height are shadow or tyre; both above the road
-[m]."""
+"""Gaussians below SILLS [m] that reach down to SHADOW [m] above the road are shadow or tyre."""
 FLOOR = 0.2
 """Height of the floor above the road [m]."""
 INSET = (0.16, 0.06)
 """Inset of the floor from the ends and from the sides [m]."""
 ROUNDED = 4.0
-"""Exponent of its superelliptic outline, without corners where bumpers are round."""
+"""Exponent of its superelliptic outline, which is rounded like bumpers."""
 PITCH, THICK = 0.07, 0.012
 """Spacing of its Gaussians, and half their thickness [m]."""
 SHEET, FRAME, EXHAUST = 0.12, 0.2, 0.34

@@ -255,7 +255,7 @@ def recorded_track(trajectory: Trajectory, start_us: int, end_us: int) -> BoxTra
     """The tracked boxes in (``start_us``, ``end_us``] [us].
 
     Raises:
-        PhysicsError: if there is no box in that interval.
+        PhysicsError: if the interval has no box.
     """
     times = np.asarray(trajectory.times_us)
     own = np.flatnonzero((times > start_us) & (times <= end_us))
@@ -423,7 +423,7 @@ class ObjectCalibration:
     cell: float
 
     def figures(self) -> dict[str, Any]:
-        """As JSON values; None for factors that the observations do not determine."""
+        """The result as JSON values; None for factors that the observations do not determine."""
         found = self.fit
 
         def finite(values: Mapping[str, float]) -> dict[str, float | None]:
@@ -456,7 +456,7 @@ def calibrate_object(
     on_run: Callable[[int], None] | None = None,
     cancelled: Callable[[], bool] | None = None,
 ) -> ObjectCalibration:
-    """Fit factors so that the simulation matches the observations.
+    """Fit factors on initial values that make the simulation match the observations.
 
     Args:
         scene, state, options: simulation with initial values; its duration follows from the
@@ -502,7 +502,7 @@ class CalibrationCancelled(Exception):
 
 
 class _Trials:
-    """Simulations from the same start with varying values."""
+    """Simulations from the same start with different values."""
 
     def __init__(
         self,
@@ -591,7 +591,7 @@ def _scaled(material: Material, factors: Mapping[str, float]) -> Material:
         "viscosity": viscosity * material.viscosity,
     }
     if isinstance(material, Snow):
-        # It yields at a strain; the stress there is the strain times Young's modulus.
+        # The material yields at a given strain; the yield stress is strain times Young's modulus.
         strain = material.critical_compression * strength / stiffness
         changed["critical_compression"] = min(strain, CRUSH_MOST)
     elif "yield_stress" in material.__dataclass_fields__:

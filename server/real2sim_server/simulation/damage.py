@@ -98,13 +98,13 @@ def _piecewise(places: Float, corners: Float) -> tuple[Float, Float]:
 # Particles are a tenth of a metre apart and only give the local shortening. A sheet shortened by a
 # fraction 1 - s folds: with folds every ``wavelength`` of its own length and flat flanks, a chord
 # of s per unit length gives flanks at the angle acos(s) and an amplitude of wavelength / 4 sqrt(1 -
-# s^2). Flanks keep their length, so their Gaussians leave no gaps, and they rotate, so that they
-# are shaded like folds. A bonnet has one fold at half its length, by design.
+# s^2). Flanks keep their length, so their Gaussians leave no gaps. They rotate, so they are shaded
+# like folds. A bonnet has one fold at half its length, by design.
 
 WAVELENGTHS = (0.36, 0.17)
 """Wavelengths of folds and of the creases between them, along the sheet [m]."""
 SHARES = (0.8, 0.35)
-"""Fraction of the shortening that each takes up."""
+"""Fractions of the shortening taken up by folds and by creases."""
 IRREGULAR = 1.7
 """Amplitude of the deviation of folds from straight lines [rad]."""
 ELASTIC = 0.03
@@ -134,7 +134,7 @@ GROUND = 0.3
 SLANT, HEIGHT = 0.6, 0.8
 """Light from one side: horizontal offset from the normal at rest, and vertical component."""
 AHEAD = np.array([0.45, 0.4, 0.0])
-"""Its horizontal direction for surfaces that face up."""
+"""Horizontal direction of this light for surfaces that face up."""
 DARKEST, BRIGHTEST = 0.35, 1.7
 DENT = (0.03, 0.14)
 """Depths at which dented sheet starts to crumple, and is fully crumpled [m]."""
@@ -339,8 +339,8 @@ def _between(first: Float, second: Float) -> Float:
 def _lit_from(normals: Float) -> Float:
     """[G, 3] direction of the light on surfaces with unit ``normals`` [G, 3] at rest.
 
-    The recorded colours include the original lighting. Light therefore comes from obliquely above
-    each surface, so that every rotation makes it lighter or darker.
+    The recorded colours include the original lighting. Light is therefore placed obliquely above
+    each surface: every rotation makes the surface lighter or darker.
     """
     x, y = normals[:, 0], normals[:, 1]
     beside = np.stack([x - y, x + y, np.zeros(len(x))], axis=1) * np.sqrt(0.5)
@@ -361,7 +361,7 @@ SH_0 = 0.28209479177387814
 GLASS_DARKER = 0.7
 """Glass is darker than this fraction of the vehicle's paint, within the box of a pane."""
 OTHER_HUE = 0.05
-"""Or its share of a colour channel differs by this, for glass that reflects the sky."""
+"""Or its share of a colour channel differs by this much, for glass that reflects the sky."""
 LEANING = 0.12
 """Inward lean of side windows, as a fraction of the width."""
 OF_GLASS = 0.1

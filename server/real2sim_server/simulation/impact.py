@@ -1,8 +1,8 @@
 """A single impact of two bodies with permanent deformation.
 
-The closed loop has rigid bodies; this module computes how an impact changes their shapes. It
-ignores road, gravity and wheels: over the tenth of a second of a crash, their effect on velocities
-is about a twentieth of that of the crash.
+The closed loop uses rigid bodies; this module computes how an impact changes their shapes. It
+ignores road, gravity and wheels: during the tenth of a second of a crash, their effect on
+velocities is about a twentieth of the crash's effect.
 """
 
 from __future__ import annotations
@@ -127,7 +127,7 @@ def object_body(
         friction: friction coefficient of its surface.
 
     Raises:
-        ParticleError: as ``fill_object``.
+        ParticleError: from ``fill_object``.
     """
     spacing = _spacing(size)
     filling = fill_object(cloud, size, spacing=spacing, mass=mass, category=category)

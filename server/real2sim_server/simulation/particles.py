@@ -29,7 +29,7 @@ NEIGHBOURS = 20
 FLAT = 0.05
 """Second moments below this times spacing^2 do not determine the gradient along their axis."""
 STRETCH_LIMITS = (0.2, 2.0)
-"""Stretch limits of a Gaussian, so that it does not become a sheet across a tear."""
+"""Stretch limits of a Gaussian; without them, it would become a sheet across a tear."""
 TURNED = 1e-3
 """Minimum rotation, as a matrix entry, at which colours are rotated."""
 
@@ -80,7 +80,7 @@ class Embedding:
         self._trust = np.clip(2.5 - beyond, 0, 1)[:, None, None]
 
     def near(self, particles: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """[G] whether points follow any of the particles [N]."""
+        """[G] whether each point follows any of the particles [N]."""
         found: NDArray[np.bool_] = np.any(particles[self._index], axis=1)
         return found
 
@@ -175,7 +175,7 @@ def _turned(cloud: GaussianCloud, rotations: Float) -> torch.Tensor:
     index = np.flatnonzero(turned)
     sh = cloud.sh.detach().cpu().numpy().astype(np.float64)
     directions = _directions()
-    # The turned function at R d is the old one at d: fit through fixed directions.
+    # The rotated function at R d equals the original at d: fit it at fixed directions.
     before = sh_basis(directions, degree)
     turned_basis = sh_basis(directions @ rotations[index].transpose(0, 2, 1), degree)
     for band in range(1, degree + 1):

@@ -38,7 +38,7 @@ from .rigid import RigidMotion, clearance
 QUIET = 2
 """Steps without an impulse after which an impact is over."""
 NOTHING = 1e-3
-"""Fraction of the previous impulse below which there is none."""
+"""Impulses below this fraction of the previous one count as zero."""
 EXACT = 0.01
 """Tolerance of the separation speed, as a fraction of the approach; no correction within it."""
 MIN_APPROACH = 0.3
@@ -524,7 +524,7 @@ def _is_far(solid: Solid, centre: Float, reach: float) -> bool:
 
 
 def _still(body: DeformableBody) -> Any:
-    """The body for the solver, at its place; the test impact sets the velocities."""
+    """The body for the solver, at the contact; the test impact sets the velocities."""
     return replace(body.solver_body(), particle_velocities=None, particle_gradients=None)
 
 

@@ -188,8 +188,8 @@ def _balanced(body: DeformableBody, contacts: Sequence[Contacts], gravity: Float
 GENTLE_THRESHOLD = 0.3
 """Maximum closing speed of a contact that carries load without deforming or bouncing [m/s]."""
 STEADY_THRESHOLD = 2.0
-"""Maximum acceleration away from a collider at rest on it [m/s^2]; above, the body is still
-bouncing."""
+"""Maximum acceleration away from a collider for a body at rest on it [m/s^2]; above this, the body
+is still bouncing."""
 SWEEPS = 30
 """Passes over all contacts in a step."""
 DRIFT = 0.1
@@ -198,7 +198,7 @@ LAID_THRESHOLD = 0.1
 """Points higher than this above a collider carry no load yet [spacings]."""
 PUSH, PUSH_SPEED = 0.2, 0.05
 """Fraction of the excess depth corrected in a step, and maximum correction speed [m/s]. Corrections
-move bodies without changing their velocities, so that they come to rest."""
+move bodies without changing their velocities; bodies therefore come to rest."""
 SLOP = 1e-4
 """Tolerance of the rest gap [m]; correcting smaller errors would keep bodies in motion."""
 PUSH_SWEEPS = 10
@@ -267,7 +267,7 @@ class RestingContacts:
         self._touches: dict[Pair, list[ContactPoint]] = {}
 
     def holds(self, body: DeformableBody, other: str) -> bool:
-        """Whether there is a contact between a body and another body or collider."""
+        """Whether a body has a contact with another body or collider."""
         return (body.name, other) in self._touches or (other, body.name) in self._touches
 
     def partners(self, body: DeformableBody) -> set[str]:
@@ -295,7 +295,7 @@ class RestingContacts:
         colliders: Sequence[Collider],
         others: Iterable[DeformableBody],
     ) -> bool | None:
-        """Add a body if its contacts are gentle; return whether they are, None without contact.
+        """Add a body if its contacts are gentle. Returns whether they are; None without contact.
 
         Args:
             body: rigid body.

@@ -1,4 +1,4 @@
-"""Results of a simulation: poses, shapes, contacts, energies, and its frames for the renderer."""
+"""Results of a simulation (poses, shapes, contacts, energies), and frames for the renderer."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class ObjectResult:
         spacing: particle spacing [m].
         rest: [N, 3] float32, particles at rest, object frame [m].
         positions, quaternions: [F, 3] float64 [m], [F, 4] wxyz: ``T_world_object``.
-        velocities, angular_velocities: [F, 3] of the centre of mass, world frame [m/s], [rad/s].
+        velocities, angular_velocities: [F, 3] at the centre of mass, world frame [m/s], [rad/s].
         modes: [F] uint8, value of ``body.BodyMode``.
         shape_index: [F] int32, row of ``shapes`` at each frame; -1 if undeformed.
         shapes: [S, N, 3] float16, particle displacements, object frame [m].
@@ -105,8 +105,8 @@ class Rebound:
         requested: requested coefficient of restitution.
         achieved: restitution in test impacts; for the simulated impacts see Bounce.
         elastic: restitution without added viscosity, the maximum.
-        other: name of the collider used for the fit; None if the body hits nothing, so that a wall
-            across its path was used.
+        other: name of the collider used for the fit; None for a wall across the body's path, used
+            if the body hits nothing.
         speed: speed of the test impacts [m/s].
         viscosity: added viscosity [Pa s].
     """
@@ -119,7 +119,7 @@ class Rebound:
     viscosity: float
 
     def figures(self) -> dict[str, Any]:
-        """As JSON values."""
+        """The rebound as JSON values."""
         return {k: round(v, 6) if isinstance(v, float) else v for k, v in asdict(self).items()}
 
 
@@ -139,7 +139,7 @@ class SimulationResult:
             Rebound and its ``bounces`` for each object with a requested restitution; and with
             ``background`` the boxes of the background (JSON values only).
         breakages: broken vehicle parts; None if they were not computed (``paper`` preset and
-            results of older versions), in which case bodies are drawn smooth.
+            results of older versions). Bodies are then drawn smooth.
     """
 
     objects: Mapping[str, ObjectResult]
@@ -451,7 +451,7 @@ class _Damaged:
         return row, tuple(loose)
 
     def cloud(self, shown: int, time_s: float) -> GaussianCloud:
-        """Its Gaussians in the shape ``shown``, ``time_s`` [s] after the start."""
+        """The vehicle's Gaussians in the shape ``shown``, ``time_s`` [s] after the start."""
         if self._most is None or self._upto > shown:
             self._upto, self._most = 0, None
         for row in range(self._upto, shown + 1):

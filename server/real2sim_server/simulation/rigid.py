@@ -43,7 +43,7 @@ class RigidMotion:
     Attributes:
         rotation: [3, 3], object to world.
         centre: [3] centre of mass in the world [m].
-        velocity: [3] of the centre of mass [m/s].
+        velocity: [3] velocity of the centre of mass [m/s].
         angular_velocity: [3] world axes [rad/s].
         mass: [kg].
         inertia: [3, 3] about the centre of mass, object axes [kg m^2].
@@ -58,22 +58,22 @@ class RigidMotion:
 
     @property
     def world_inertia(self) -> Float:
-        """[3, 3] about the centre of mass, world axes [kg m^2]."""
+        """[3, 3] inertia about the centre of mass, world axes [kg m^2]."""
         return self.rotation @ self.inertia @ self.rotation.T
 
     @property
     def momentum(self) -> Float:
-        """[3] [kg m/s]."""
+        """[3] linear momentum [kg m/s]."""
         return self.mass * self.velocity
 
     @property
     def angular_momentum(self) -> Float:
-        """[3] about the centre of mass [kg m^2/s]."""
+        """[3] angular momentum about the centre of mass [kg m^2/s]."""
         return self.world_inertia @ self.angular_velocity
 
     @property
     def kinetic(self) -> float:
-        """Energy of motion [J]."""
+        """Kinetic energy [J]."""
         turning = self.angular_velocity @ self.angular_momentum
         return float(self.mass * self.velocity @ self.velocity + turning) / 2
 

@@ -268,7 +268,7 @@ def simulate(
     on_progress: Progress | None = None,
     cancelled: Callable[[], bool] | None = None,
 ) -> SimulationResult:
-    """Simulate objects that move, collide, deform and come to rest.
+    """Simulate the motion, collisions and deformation of objects until the end of the rollout.
 
     Args:
         scene: scene with the Gaussians.

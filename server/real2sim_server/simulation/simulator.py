@@ -141,10 +141,10 @@ def energies(bodies: Iterable[DeformableBody], gravity: Float) -> tuple[float, f
     return kinetic, elastic, potential
 
 
-# Unyielding bodies stay rigid and act as colliders for other bodies. For example, a cone does not
-# dent a truck. If the total energy of an impact cannot dent a body by more than its particles
-# resolve, only the lighter body deforms. The other body is represented by a few boxes on its nearby
-# surface and receives the exchanged impulse and moment.
+# Unyielding bodies stay rigid and act as colliders for other bodies: a cone does not dent a truck.
+# If the total energy of an impact cannot dent a body by more than its particles resolve, only the
+# lighter body deforms. The other body is represented by a few boxes on its nearby surface and
+# receives the exchanged impulse and moment.
 
 LIGHTER = 10.0
 """Minimum mass ratio at which the heavier body may stay rigid."""

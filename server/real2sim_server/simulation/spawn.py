@@ -71,7 +71,7 @@ class WithEgo:
     """A scenario's objects and the ego.
 
     Attributes:
-        visible: all of them, the ego last.
+        visible: all visible objects, the ego last.
     """
 
     visible: tuple[PlacedObject, ...]
@@ -202,7 +202,7 @@ PENETRATION_MAX = 0.3
 VOLUME_SPACING, VOXELS_MAX = 0.05, 1_000_000
 """Edge of the voxels for measuring volume [m], and their maximum number per box."""
 OVERLAP_FRACTION = 0.01
-"""Bodies overlap when this fraction of one's particles is among the other's."""
+"""Bodies overlap if this fraction of one body's particles is among the particles of the other."""
 
 
 def spawn_bodies(
@@ -220,8 +220,8 @@ def spawn_bodies(
     """A body for each requested object, in its start state.
 
     Raises:
-        PhysicsError: for an object that is absent at ``start_us``, for overlapping objects, and as
-            ``fill_object``.
+        PhysicsError: for an object that is absent at ``start_us``, for overlapping objects, and the
+            errors of ``fill_object``.
     """
     subjects = _subjects(state, wanted, start_us)
     preset = filled_as_wanted(preset, subjects, list(wanted.values()), max_particles)
@@ -261,7 +261,7 @@ class Start:
 def starts_of(
     state: PlacedObjects, wanted: Mapping[str, ObjectPhysics], start_us: int
 ) -> list[Start]:
-    """Start of each requested object. Raises as :func:`spawn_bodies`."""
+    """Start of each requested object. Raises like :func:`spawn_bodies`."""
     subjects = _subjects(state, wanted, start_us)
     return [
         Start(
@@ -433,7 +433,7 @@ def _spawn_body(
         materials, regions, particles = preset.build(subject.category, particles, preset.spacing)
     else:
         materials, regions = (physics.material,), np.zeros(len(particles), dtype=np.int64)
-    # A structure has moved mass between its zones.
+    # The structure has moved mass between its zones.
     particles = _with_centre(particles, subject, preset)
     density = physics.density
     if density is None and preset.by_density:

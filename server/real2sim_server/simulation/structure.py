@@ -1,4 +1,4 @@
-"""Structure of objects: presets of materials, vehicles as matter and as impact partners."""
+"""Structure of objects: crash structure and stiffness of vehicles, masses, material presets."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ from ..physics.materials import (
 
 # A vehicle is a stiff core with yielding zones around it: front and rear, sides (door, sill and B
 # pillar together) and roof. Each zone has a force-deflection curve from published tests.
-# :func:`vehicle_structure` derives materials so that the particles of a zone carry that force; the
-# closed loop uses the same values per area of overlap.  Front and rear have two layers in series.
+# :func:`vehicle_structure` derives materials whose particles carry the force of their zone; the
+# closed loop uses the same values per area of overlap. Front and rear have two layers in series.
 # The outer one (bumper, skin, headlamps, attachments) folds at low force and slowly recovers. The
 # inner one (rails) keeps its crush. This reproduces a car with 0.6 m dynamic crush, a rebound at a
 # fraction of its speed, and 0.26 m residual crush.
@@ -95,7 +95,7 @@ END, OUTER = 0.2875, 0.1745
 END_HEIGHT = 1.35
 """Height of the section to which the stresses of the ends refer [m], as in the barrier test."""
 MIN_SECTION = 0.3
-"""Minimum filled height of a section [m]; lower ones come from incomplete recordings."""
+"""Minimum filled height of a section [m]; lower values are due to incomplete recordings."""
 OUTER_DENSITY = 0.35
 """Density of the outer layer relative to the rest; engine and axles are behind it."""
 ROOF_DENSITY = 0.12
@@ -121,7 +121,7 @@ CORE_MATERIAL = Snow(
     hardening=4.0,
     viscosity=5e3,
 )
-"""Survival cell and drivetrain: stays intact while all other zones yield."""
+"""Survival cell and drivetrain, which stay intact while all other zones yield."""
 RAILS_MATERIAL = Snow(
     young=2.27e7,
     poisson=0.0,
@@ -146,7 +146,7 @@ that low-speed restitution does not return."""
 END_MATERIALS: tuple[Material, ...] = (RAILS_MATERIAL, FOLDS_MATERIAL, SPRINGS_MATERIAL)
 SIDE_STRESS = 0.0855
 """Stress of a side relative to the ends for the same force per width and deflection. A side is
-shallower, and the neighbourhood of the impact point is carried along."""
+shallower, and an impact also moves the surrounding structure."""
 
 
 def vehicle_structure(
@@ -159,7 +159,7 @@ def vehicle_structure(
         particles: particles at rest, vehicle frame (x forward, z up); their masses sum to its mass.
         spacing: particle spacing [m].
         section_height: height of the ends if the particles are a central column of the vehicle [m];
-            such a column has no sides and no roof.
+            a column has no sides and no roof.
     """
     structure = STRUCTURES[category]
     low = particles.positions.min(axis=0) - spacing / 2
@@ -249,7 +249,7 @@ class ClassMass:
         per_volume: mass per volume of the object's box [kg/m^3].
         source: source of the value.
         person: whether it includes a person as high as the box.
-        besides: mass in addition to the person [kg].
+        besides: mass in addition to the person, such as a bicycle [kg].
         stability: static stability factor, half the track over the height of the centre of mass;
             None to use the centre of mass of the filled shape.
         stability_source: source of that factor.
@@ -427,12 +427,12 @@ class Preset:
     Attributes:
         name: ``paper`` or ``vehicle``.
         spacing: particle spacing [m]; cells are twice as large.
-        vehicle_spacing: the same if only vehicles take part; their crumple zones are large enough
+        vehicle_spacing: the same if all objects are vehicles; their crumple zones are large enough
             for coarser cells.
         cfl: fraction of a cell that waves may cross in a substep; damped materials allow longer
             substeps than elastic ones.
         friction: friction coefficient between surfaces and on the ground.
-        wheels: whether vehicles stand on tyres.
+        wheels: whether vehicles have tyres.
         clearance: height of the wheels below the body of vehicles on tyres [m].
         by_density: whether mass is density times volume instead of the default of the category.
         build: ``build(category, particles, spacing)``, returns materials, the material index of
@@ -457,7 +457,7 @@ def _paper(category: str, particles: Particles, spacing: float) -> Build:
 
 
 def _vehicle(category: str, particles: Particles, spacing: float) -> Build:
-    """Vehicles have crumple zones; other objects are soft foam."""
+    """Vehicles with crumple zones; other objects are soft foam."""
     if category in VEHICLES:
         return vehicle_structure(category, particles, spacing=spacing)
     foam = Foam(young=4e5, poisson=0.3, yield_stress=3e4, plastic_viscosity=2e3, viscosity=400)

@@ -47,7 +47,7 @@ def advance_on_wheels(
         rotation: [3, 3] object to world; updated.
         motion: [3, 3] rows centre, velocity and angular velocity; updated.
         mass, inertia: see ``RigidMotion``.
-        origin: [3] from the centre of mass to the object's origin, object frame [m].
+        origin: [3] vector from the centre of mass to the object's origin, object frame [m].
         patches, static_load, rest: see ``Tyres``; [0, 3], [0], [0] without tyres.
         tyres: [5] tyre parameters.
         rows, heights: packed colliders that support tyres.
@@ -220,31 +220,31 @@ def vector(row: Any) -> Any:
 
 @func
 def dot(a: Any, b: Any) -> Any:
-    """Scalar product."""
+    """Scalar product of two vectors."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @func
 def cross(a: Any, b: Any) -> Any:
-    """Vector product."""
+    """Cross product of two vectors."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 @func
 def plus(a: Any, b: Any) -> Any:
-    """Sum."""
+    """Sum of two vectors."""
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
 @func
 def minus(a: Any, b: Any) -> Any:
-    """Difference."""
+    """Difference of two vectors."""
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
 @func
 def scaled(factor: Any, a: Any) -> Any:
-    """Product with a number."""
+    """Product of a number and a vector."""
     return factor * a[0], factor * a[1], factor * a[2]
 
 
@@ -332,19 +332,19 @@ class Tyres:
     def standing(self, T_world_object: Float, road: Sequence[Collider]) -> Tyres:
         """Tyres whose rest heights match the current pose, for wheels close to the road.
 
-        Tracked boxes miss the road by a few centimetres, which must not cause a jump. Vehicles that
-        are higher up fall.
+        Tracked boxes miss the road by a few centimetres, which must not cause a jump. Vehicles
+        higher above the road fall.
         """
         heights, _ = nearest(road, self._points(T_world_object))
         near = (heights < ABOVE_MAX) & (heights > -LIFT_MAX)
         return replace(self, rest=np.where(near.all(), heights, np.zeros(4)))
 
     def braked(self, fraction: float) -> Tyres:
-        """The tyres with ``fraction`` of their grip braked, in [0, 1]."""
+        """The tyres with a ``fraction`` of their grip braked, in [0, 1]."""
         return replace(self, brake=fraction)
 
     def lifts(self, T_world_object: Float, road: Sequence[Collider]) -> Float:
-        """[4] spring compression that puts the wheels on the road instead of inside it [m]."""
+        """[4] spring compression that keeps the wheels from sinking into the road [m]."""
         heights, normals = nearest(road, self._points(T_world_object))
         carrying = np.isfinite(heights) & (normals @ T_world_object[:3, 2] > UPRIGHT)
         squeeze = np.where(carrying, self.rest - heights, 0.0)

@@ -50,7 +50,7 @@ def signed_gaps_into(box, centres, yaws, sizes, found):
         dx, dy = centres[k, 0] - x, centres[k, 1] - y
         turned = yaws[k] - yaw
         cos, sin = math.cos(turned), math.sin(turned)
-        # The other centre in the frame of the box, and the box's centre in the other's frame.
+        # Each rectangle's centre in the frame of the other one.
         tx, ty = c * dx + s * dy, c * dy - s * dx
         ox, oy = -(cos * tx + sin * ty), -(cos * ty - sin * tx)
         la, wa, lb, wb = length / 2, width / 2, sizes[k, 0] / 2, sizes[k, 1] / 2
@@ -145,8 +145,8 @@ MAX_MARGIN = 100.0
 AT_FAULT, PER_SPEED = 0.5, 0.05
 """Criticality of an at-fault collision, and additional criticality per m/s of its speed."""
 NOT_AT_FAULT = -1.0
-"""Maximum criticality of a collision caused by others. It equals a margin of one second, so that no
-search ends there."""
+"""Maximum criticality of a collision caused by others. It equals a margin of one second, to prevent
+searches from ending there."""
 
 
 def adversaries_of(
@@ -154,7 +154,7 @@ def adversaries_of(
 ) -> frozenset[str]:
     """Adversaries of a case: objects with drivers, in a storyboard, or edited.
 
-    Empty if the case names none; then all objects count.
+    Empty if the case names no adversaries; all objects then count.
 
     Args:
         reset: options of an episode.
@@ -174,15 +174,15 @@ class Danger:
 
     The margin of a time step is the time until the front bumper touches another object at constant
     velocities, with the remaining lateral gap converted to time. Objects behind or alongside are
-    ignored, because they say nothing about the driver. The margin of the episode is a smooth
-    minimum over time. :meth:`criticality` is its negative in seconds, and is positive only for
-    at-fault collisions.
+    ignored, because they do not reflect the driver's performance. The margin of the episode is a
+    smooth minimum over time. :meth:`criticality` is its negative in seconds, and is positive only
+    for at-fault collisions.
 
     Attributes:
         adversaries: objects to consider, see :func:`adversaries_of`; empty for all. Parked cars
             on the route would otherwise mask the distance to the adversaries of the case.
         gap: minimum distance from the ego's box to another's so far [m], negative if they overlap.
-        margin: minimum so far [s].
+        margin: minimum margin so far [s].
     """
 
     adversaries: frozenset[str] = frozenset()
@@ -253,7 +253,7 @@ class CameraFeed:
 
     @classmethod
     def of(cls, scene: Scene, needs: Needs) -> CameraFeed | None:
-        """The feed that a planner needs; None for one without images.
+        """The feed that a planner needs; None for a planner without images.
 
         Raises:
             ValueError: images other than colour, or a camera missing in the scene.
@@ -351,11 +351,11 @@ class Driven:
     """A finished episode.
 
     Attributes:
-        world: at its end; None if it could not start.
+        world: world at the end of the episode; None if it could not start.
         danger: criticality over the episode.
         error: the reason why it could not start, or the planner's exception; None on success.
         entries: contents of a recording; empty unless requested.
-        worlds: at every step; empty unless requested.
+        worlds: worlds of all steps; empty unless requested.
     """
 
     world: World | None
@@ -396,7 +396,8 @@ def drive_episode(
 ) -> Driven:
     """Let a planner drive an episode; an exception of the planner ends it.
 
-    As over the network, edits are applied at the start time, after the planner's first observation.
+    Edits are applied at the start time, after the planner's first observation, as in sessions of a
+    worker.
 
     Args:
         scene: scene of the case.
@@ -408,7 +409,7 @@ def drive_episode(
     """
     needs = needs_of(planner)
     try:
-        # A planner without declared needs gets everything, as in `real2sim drive`.
+        # A planner without declared needs receives everything, as in `real2sim drive`.
         privileged = needs.privileged or not hasattr(planner, "needs")
         world = begin(scene, drive, needs, privileged=privileged)
     except (WorldError, ValidationError) as error:
@@ -437,7 +438,7 @@ def drive_episode(
             if keep_worlds:
                 driven.worlds.append(world.fork())
             world.step(plan)
-        except Exception as error:  # A planner may raise anything; it ends its own episode only.
+        except Exception as error:  # A planner may raise anything; only its episode ends.
             driven.error = f"{type(error).__name__}: {error}"[:500]
             break
         if keep_entries:
@@ -450,7 +451,7 @@ def drive_episode(
 
 
 def observation_of(world: World, feed: CameraFeed | None = None) -> Observation:
-    """The observation that a session would send."""
+    """The observation as a session would send it."""
     obs = observation_from_wire(Obs(**world.observe().obs_fields(), frames=[]))
     return obs if feed is None else feed.added_to(obs, world)
 

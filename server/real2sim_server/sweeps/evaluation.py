@@ -1,4 +1,4 @@
-"""The value of a point of a space to a search: how critical it is, and whether it is avoidable."""
+"""Scores of points for a search: their criticality, and whether failures are avoidable."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from .spec import Space
 
 # --- Reference driver ----------------------------------------------------------------------------
 
-# The reference driver knows the future. It tries manoeuvres in copies of the world, with the actual
-# behaviour of all others. A collision that it avoids was avoidable.
+# The reference driver has perfect foresight. It tries manoeuvres in copies of the world, with the
+# actual behaviour of all others. A collision that it avoids was avoidable.
 
 CRUISE = 8.0
-"""Cruising speed without hindrance, unless it starts faster [m/s]."""
+"""Free-flow cruising speed, unless the vehicle starts faster [m/s]."""
 HORIZON, SPACING = 4.0, 0.2
 """Horizon of a tried manoeuvre, and spacing of the poses of its plan [s]."""
 DECIDES_EVERY = 0.3
@@ -46,8 +46,8 @@ class Manoeuvre:
 
     Attributes:
         aside: final lateral offset from the route, positive on the left [m].
-        acceleration: along the route until standstill or ``most`` [m/s^2].
-        most: speed [m/s].
+        acceleration: acceleration along the route until standstill or ``most`` [m/s^2].
+        most: maximum speed [m/s].
     """
 
     aside: float
@@ -56,7 +56,7 @@ class Manoeuvre:
 
     @property
     def effort(self) -> float:
-        """Ranks manoeuvres: the mildest is preferred."""
+        """Sort key of manoeuvres; the mildest is preferred."""
         return abs(self.acceleration) + abs(self.aside)
 
 
@@ -65,11 +65,11 @@ class Drove:
     """Outcome of the reference driver.
 
     Attributes:
-        survived: no contact, on the road, with the minimum distance to others.
+        survived: whether it had no contact, stayed on the road and kept the minimum distance.
         gap: minimum distance to others [m].
         effort: maximum requested acceleration [m/s^2].
         steps: number of steps.
-        world: at the end.
+        world: world at the end.
     """
 
     survived: bool
@@ -171,7 +171,7 @@ def _chosen(
     The current manoeuvre is preferred.
     """
     best, best_end = tried[0], (-math.inf, -math.inf)
-    # The mild one first, then the current one, to avoid oscillation.
+    # Try the mildest first, then the current one, to avoid oscillation.
     for manoeuvre in dict.fromkeys([tried[0], before, *tried]):
         end = _end(world, manoeuvre, wanted)
         if end[0] == math.inf:
@@ -249,7 +249,7 @@ class DrivingStatistics:
         return cls(found.mean(axis=0), np.maximum(found.std(axis=0), MIN_SPREAD))
 
     def distance(self, features: Array) -> float:
-        """Mahalanobis distance beyond the ordinary; 0 without statistics."""
+        """Mahalanobis distance beyond the normal range; 0 without statistics."""
         if self.mean is None or self.spread is None:
             return 0.0
         z = (features - self.mean) / self.spread
@@ -284,7 +284,7 @@ class Watch:
     def implausibility(self) -> float:
         """0 for normal human driving, about 1 for implausible driving.
 
-        Implausible cases are allowed, but not instructive.
+        Implausible cases are allowed, but rank lower.
         """
         found = max(START_GAP - self._start_gap, 0.0) / START_GAP
         for track in self._tracks.values():
@@ -316,7 +316,7 @@ def _motion(points: Array, dt: float) -> Array:
     velocity = np.diff(points, axis=0) / dt
     if len(velocity) < 3:
         return np.zeros((0, 3))
-    # Smoothed over three instants, because positions are rounded and drivers react at clock steps.
+    # Smooth over three instants, because positions are rounded and drivers react at clock steps.
     smooth = (velocity[:-2] + velocity[1:-1] + velocity[2:]) / 3
     change = np.diff(smooth, axis=0) / dt
     speed = np.hypot(smooth[:-1, 0], smooth[:-1, 1])
@@ -361,7 +361,7 @@ class Evaluation:
         point: coordinates from 0 to 1.
         values: values of the parameters.
         drive: the episode.
-        score: higher is nearer to an avoidable failure; positive for one.
+        score: score of the search; higher is closer to an avoidable failure, positive for one.
         criticality: criticality of the tested planner's episode.
         implausibility: subtracted from it.
         at_fault: whether the planner caused a collision.
@@ -445,7 +445,7 @@ class Evaluator:
         )
 
     def reference(self, drive: Drive) -> Drove:
-        """The same episode, driven by the reference driver."""
+        """Drive the same episode with the reference driver."""
         world = begin(self.scene, drive, Needs(), privileged=False)
         if drive.operations:
             world.apply(OPERATIONS.validate_python([dict(o) for o in drive.operations]))

@@ -1,4 +1,4 @@
-"""Failures of a search: how they are reported, shrunk, and written as scenario files."""
+"""Failures of a search: reports, shrinking and scenario files."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Boundary:
 
 
 def boundaries(evaluate: Evaluator, failure: Evaluation) -> list[Boundary]:
-    """The nearest boundary of each parameter that alone leads to safety, sorted by distance.
+    """The nearest boundary of each parameter that alone can avoid the failure, sorted by distance.
 
     Both ends of a parameter are tried; if one is safe, the interval is bisected.
     """
@@ -160,7 +160,7 @@ def write_scenario(
 
 
 def _same_options(mine: Mapping[str, Any], theirs: Mapping[str, Any]) -> bool:
-    """Whether two resets define the same episode."""
+    """Whether two sets of reset options define the same episode."""
     return _plain(mine) == _plain(theirs)
 
 
@@ -169,7 +169,7 @@ def _plain(options: Mapping[str, Any]) -> str:
     board = fields["storyboard"] or {}
     for key in NAMING:
         board.pop(key, None)
-    # The road network file has another name next to the scenario.
+    # The road network file next to the scenario has a different name.
     if (board.get("roads") or {}).get("kind") == "map":
         board["roads"].pop("file", None)
     return json.dumps(fields, sort_keys=True)
@@ -199,7 +199,7 @@ class Failure:
         recording: recording of the planner's episode.
         replays: whether the recording replays bitwise.
         avoidable_until: latest take-over by the reference that avoids the impact, in seconds before
-            it; None if there is none, or plans are not trajectories.
+            it; None if no take-over does, or if plans are not trajectories.
         boundaries: boundaries, nearest first.
         film: film file, or None.
         scenario: its scenario file; None if the case is not a storyboard.

@@ -1,7 +1,8 @@
-"""The search: spread points, then points that a surrogate expects to be more critical.
+"""The search: space-filling points first, then points with high expected criticality.
 
-After the first finding, CMA-ES and variations of the finding look for other kinds of failures. All
-random numbers come from the seed, so the search is reproducible.
+A surrogate predicts the criticality. After the first finding, CMA-ES and variations of the finding
+search for other kinds of failures. All random numbers depend on the seed, so the search is
+reproducible.
 """
 
 from __future__ import annotations
@@ -28,14 +29,14 @@ class Archive:
 
     Attributes:
         elites: avoidable failures with the highest score, by cell.
-        first: number of the first evaluation with a failure, from 1; None without one.
+        first: number of the first evaluation with a failure, from 1; None without a failure.
     """
 
     elites: dict[Cell, Evaluation] = field(default_factory=dict)
     first: int | None = None
 
     def add(self, found: Evaluation, number: int) -> bool:
-        """Add a failure in a new cell, or one with a higher score than the cell's elite.
+        """Add a failure if its cell is new or its score is higher than that of the cell's elite.
 
         Returns whether it was added.
         """
@@ -145,7 +146,7 @@ def _likeliest(points: Array, unit: Array) -> Array:
     options: Any = {"maxiter": 20}
     start = np.full(points.shape[1], np.log(0.5))
     found = minimize(cost, start, method="L-BFGS-B", bounds=bounds, options=options)
-    # Rounded, so that different summation orders on other threads give the same result.
+    # Rounding gives the same result for different summation orders on other threads.
     scales: Array = np.round(np.exp(found.x), 3)
     return scales
 
@@ -169,7 +170,7 @@ REFIT = 4
 MAX_SEEN = 160
 """Maximum number of points for the surrogate: the most critical ones, and the latest."""
 UNIFORM, NEAR, AROUND = 600, 60, 6
-"""Candidates: anywhere, number of most critical points, and candidates around each of these."""
+"""Number of candidates anywhere, of the most critical points, and of candidates around each."""
 ISO, LINE = 0.05, 0.3
 """Size of a variation: isotropic, and along the line to another (Vassiliades and Mouret 2018)."""
 
@@ -210,7 +211,7 @@ class SearchState:
 def search(
     evaluate: Evaluator, budget: SearchBudget, *, on_progress: Report = lambda _d, _t: None
 ) -> SearchState:
-    """Look for avoidable failures.
+    """Search for avoidable failures.
 
     Raises:
         CommandError: the package cmaes is not installed.
@@ -229,10 +230,7 @@ def search(
 def random_search(
     evaluate: Evaluator, budget: SearchBudget, *, on_progress: Report = lambda _d, _t: None
 ) -> SearchState:
-    """Spend the same budget on independent points, alternating between spaces.
-
-    The baseline of a search.
-    """
+    """Baseline of a search: spend the same budget on independent points of alternating spaces."""
     state, rng = SearchState(), np.random.default_rng(budget.seed)
     for k in range(budget.episodes):
         space = k % len(evaluate.spaces)
@@ -279,7 +277,7 @@ def _space(spent: NDArray[np.float64], rng: np.random.Generator) -> int:
     """Select a space by Thompson sampling of the kinds of failures per batch.
 
     Args:
-        spent: [S, 2] kinds of failures and batches, per space.
+        spent: [S, 2] numbers of kinds of failures and of batches, per space.
         rng: random generator.
     """
     return int(np.argmax(rng.gamma(spent[:, 0] + 1.0) / (spent[:, 1] + 1.0)))
@@ -313,7 +311,7 @@ def _telling(seen: Sequence[Evaluation]) -> list[Evaluation]:
 
 
 def _compressed(scores: Point) -> Point:
-    """Compressed scores: a second near a collision counts as much as half of the distance to it."""
+    """Compress scores, to resolve small margins near a collision better than large ones."""
     found: Point = np.where(scores < 0.0, -np.log1p(np.maximum(-scores, 0.0)), scores)
     return found
 
@@ -388,7 +386,7 @@ def _cma(begin: Evaluation, *, seed: int) -> Any:
 def _variations(
     state: SearchState, rng: np.random.Generator, space: int
 ) -> Iterator[tuple[int, Point]]:
-    """Two generations of variations, each of a failure towards another one of its space."""
+    """Two generations of variations, each from a failure towards another one of the same space."""
     for _ in range(2 * POPULATION):
         own = [e for e in state.archive.ordered() if e.space == space]
         one = np.array(own[int(rng.integers(len(own)))].point)

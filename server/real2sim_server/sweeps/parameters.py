@@ -1,4 +1,4 @@
-"""Parameters of a space, expressions in them, and the points that are sampled."""
+"""Parameters of a space, their expressions, and sampling of points."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def names_in(expression: str) -> set[str]:
     """Parameters used in an expression.
 
     Raises:
-        ValueError: it is not an expression of numbers, names and the operators and functions above.
+        ValueError: not an expression of numbers, names and the operators and functions above.
     """
     tree = _parsed(expression)
     functions = {id(n.func) for n in ast.walk(tree) if isinstance(n, ast.Call)}
@@ -69,9 +69,9 @@ def evaluate(expression: str, values: Mapping[str, float], *, check_only: bool =
     """The value of an expression.
 
     Args:
-        expression: text.
+        expression: the expression.
         values: values of its names.
-        check_only: ignore errors caused by these values.
+        check_only: whether to ignore errors caused by these values.
 
     Raises:
         ValueError: not arithmetic, an unknown name, or a result that is not finite.
@@ -148,7 +148,7 @@ Name = ParameterName
 
 
 class FloatRange(FloatParameter):
-    """Uniform between two numbers, or uniform in its logarithm."""
+    """Uniform between two numbers, or log-uniform."""
 
     def at(self, u: float) -> float:
         """The value at a coordinate."""
@@ -206,7 +206,7 @@ class Normal(NormalParameter):
     """Normal distribution, truncated at ``low`` and ``high``."""
 
     def at(self, u: float) -> float:
-        """The value at a coordinate, which is its cumulative probability."""
+        """The value at a coordinate, which is the value's cumulative probability."""
         from scipy.special import ndtr, ndtri
 
         low, high = (ndtr((x - self.mean) / self.std) for x in (self.low, self.high))
@@ -214,7 +214,7 @@ class Normal(NormalParameter):
         return min(max(value, self.low), self.high)
 
     def coordinate(self, value: Any) -> float:
-        """Its cumulative probability."""
+        """Coordinate of a value: its cumulative probability."""
         from scipy.special import ndtr
 
         low, high, x = (
@@ -267,7 +267,7 @@ def values_at(parameters: Mapping[str, Parameter], point: Sequence[float]) -> di
 
 
 def check_derived(parameters: Mapping[str, Parameter]) -> None:
-    """Raises ValueError if a parameter is derived from one that does not precede it."""
+    """Raise ValueError if a parameter is derived from another that does not precede it."""
     known = {k for k, p in parameters.items() if not isinstance(p, Derived)}
     for name, parameter in parameters.items():
         if isinstance(parameter, Derived):
@@ -280,7 +280,7 @@ def check_derived(parameters: Mapping[str, Parameter]) -> None:
 
 # --- Sampling ------------------------------------------------------------------------------------
 
-# A grid, or a given number of points, spread or weighted.
+# Points of a grid, or a given number of space-filling or weighted points.
 
 Points = NDArray[np.float64]
 
@@ -305,7 +305,7 @@ def points_of(
 
 
 def spread(kind: str, count: int, dimensions: int, *, seed: int) -> Points:
-    """Spread points [count, dimensions] in [0, 1).
+    """Space-filling points [count, dimensions] in [0, 1).
 
     The points are a prefix of longer sequences, except for Latin hypercubes.
     """
@@ -317,7 +317,7 @@ def spread(kind: str, count: int, dimensions: int, *, seed: int) -> Points:
         return np.random.default_rng(seed).random((count, dimensions))
     if kind == "sobol":
         engine = qmc.Sobol(dimensions, rng=seed)
-        # Sample a whole power of two, as required for a balanced sequence.
+        # Balanced sequences require a power of two.
         whole = engine.random_base2(max(math.ceil(math.log2(count)), 0))
         return np.asarray(whole[:count], np.float64)
     makers = {"latin_hypercube": qmc.LatinHypercube, "halton": qmc.Halton}
@@ -335,7 +335,7 @@ def _grid(method: GridMethod, drawn: Mapping[str, Drawn]) -> Points:
 
 
 def _weighted(method: ImportanceMethod, drawn: Mapping[str, Drawn]) -> tuple[Points, Points]:
-    """In coordinates the nominal density is 1, for any distribution of a parameter."""
+    """Points and importance weights. In coordinates, any distribution has nominal density 1."""
     _check_names(method.towards, drawn)
     rng, names = np.random.default_rng(method.seed), list(drawn)
     points = rng.random((method.count, len(names)))

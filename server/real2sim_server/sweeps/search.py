@@ -1,4 +1,4 @@
-"""A complete search: failures that replay, their descriptions, and a page."""
+"""A complete search: replayable failures, their description, and a page."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from .spec import Space, open_scene
 
 # --- Statistics ----------------------------------------------------------------------------------
 
-# Which parameters matter, and how often the space fails.
+# Importance of the parameters, and failure probability of a space.
 
 Array = NDArray[np.float64]
 NORMAL_95 = 1.959964
@@ -41,7 +41,7 @@ class Probability:
 
     Attributes:
         value, low, high: estimate and interval.
-        how: method in words.
+        how: description of the method.
         episodes: number of episodes.
     """
 
@@ -84,12 +84,12 @@ def splitting(
     until all are above ``level``. Moves preserve the uniform distribution of the space.
 
     Args:
-        score: function of a point with coordinates from 0 to 1; higher is nearer to failing.
+        score: function of a point with coordinates from 0 to 1; higher is closer to a failure.
         dimensions: number of coordinates.
         level: minimum score of a failure.
         particles: number of particles, at least 10.
         seed: seed of all random numbers.
-        most_episodes: limit; beyond it the estimate is an upper bound.
+        most_episodes: maximum number of episodes; if it is reached, the estimate is an upper bound.
         moves: attempts per new particle.
     """
     from scipy.special import ndtr, ndtri
@@ -141,8 +141,8 @@ def sobol_indices(
 ) -> dict[str, tuple[float, float]]:
     """First-order and total Sobol indices of a surrogate through episodes, by parameter.
 
-    The surrogate is a smoothed thin-plate spline through the driven points. If these are uneven, as
-    after a search, the indices describe the surrogate. Empty if there are too few episodes.
+    The surrogate is a smoothed thin-plate spline through the driven points. If these are unevenly
+    distributed, as after a search, the indices describe the surrogate. Empty for too few episodes.
     """
     from scipy import stats
     from scipy.interpolate import RBFInterpolator
@@ -178,9 +178,9 @@ class SearchOptions:
     Attributes:
         budget: budget of the search itself.
         shrink: number of failures, worst first, to find boundaries for.
-        probability: episodes for the probability of an at-fault collision in each space; 0: none.
+        probability: episodes for estimating the at-fault probability of each space; 0 skips it.
         films: number of failures, worst first, to film.
-        film_width: [px].
+        film_width: width of films [px].
         scenes: folder of bundles.
     """
 
@@ -206,7 +206,7 @@ def run_search(
         Contents of ``failures.json``.
 
     Raises:
-        CommandError: spaces of several scenes, a planner that cannot drive there, no such scene.
+        CommandError: spaces of several scenes, an unsuitable planner, or no such scene.
     """
     options = options or SearchOptions()
     scene = _scene_of(spaces, options.scenes)
@@ -231,7 +231,7 @@ def _scene_of(spaces: Sequence[Space], folder: Path | None) -> Scene:
     names = list(dict.fromkeys(s.case.scene or "" for s in spaces))
     if len(names) != 1:
         raise CommandError(
-            f"a search is of one scene; the spaces are of {', '.join(names) or 'none'}"
+            f"a search needs a single scene; the spaces name {', '.join(names) or 'none'}"
         )
     return open_scene(names[0], folder)
 
@@ -246,7 +246,7 @@ def _check_planner(planner: str, scene: Scene) -> None:
 def _failure(
     evaluate: Evaluator, found: Evaluation, number: int, out: Path, options: SearchOptions
 ) -> Failure:
-    """Record a failure, write it as a case, shrink it and film it."""
+    """Record a failure, write its scenario file, shrink it and film it."""
     name = f"failure_{number + 1:02d}"
     driven = drive_episode(
         evaluate.scene,
@@ -284,7 +284,7 @@ def _scene_path(name: str, folder: Path | None) -> str:
 def _avoidable_until(driven: Driven) -> float | None:
     """Latest take-over by the reference that avoids the impact, in seconds before it.
 
-    None if there is none among the tried times, or plans are not trajectories.
+    None if none of the tried times avoids it, or if plans are not trajectories.
     """
     for before in TAKE_OVERS:
         assert driven.world is not None

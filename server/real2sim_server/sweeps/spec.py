@@ -63,14 +63,14 @@ def open_scene(name: str, folder: Path | None = None) -> Scene:
 
     Raises:
         CommandError: the bundle does not exist.
-        BundleError: it cannot be read.
+        BundleError: the bundle cannot be read.
     """
     places = [Path(name), *([folder / name] if folder is not None else [])]
     for place in places:
         if place.is_dir():
             return load_scene(place)
     if name == DEMO_SCENE:
-        # As a bundle, because recordings store its hash, as on the demo's worker.
+        # Use a bundle: recordings store its hash, as on the demo's worker.
         with tempfile.TemporaryDirectory(prefix="real2sim-street-") as made:
             unpack_street(Path(made), DEMO_SCENE)
             return load_scene(Path(made) / DEMO_SCENE)
@@ -94,11 +94,11 @@ class ScenarioSource(BaseModel):
 
     Attributes:
         file: OpenSCENARIO file (.xosc), storyboard (.json) or ``gallery:NAME``.
-        ego: entity that is the ego; None: the one with the ego's name.
+        ego: entity that is the ego; None: the entity with the ego's name.
         leave_out: unsupported elements to ignore.
-        as_it_is: the scene's world is the file's world, so nothing is placed along the scene's
-            route.
-        alone: read only the OpenSCENARIO file, without catalogs and road network.
+        as_it_is: whether the file uses the scene's world frame; nothing is then placed along the
+            scene's route.
+        alone: whether to read only the OpenSCENARIO file, without catalogs and road network.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -112,15 +112,15 @@ class ScenarioSource(BaseModel):
 
 @dataclass(frozen=True, eq=False)
 class StoryboardSpace:
-    """Makes the storyboard of each point of a space.
+    """Creates the storyboard of each point of a space.
 
-    The file is read again for each point, so a parameter can be used anywhere: in numbers as well
-    as in names, counts and texts.
+    The file is read again for each point, so parameters can be used anywhere: in numbers, names,
+    counts and texts.
 
     Attributes:
         source: scenario source.
         folder: base of its relative path.
-        scene: scene to place it in.
+        scene: scene to place the storyboard in.
         start_us: start of episodes [us]; None: start of the recording.
         names: parameters of the storyboard.
     """
@@ -132,10 +132,10 @@ class StoryboardSpace:
     names: frozenset[str]
 
     def read(self, values: Mapping[str, Value]) -> ScenarioFile:
-        """The file with values of its parameters, in its own frame. Raises as :meth:`at`."""
+        """The file with values of its parameters, in its own frame. Raises like :meth:`at`."""
         mine = {name: value for name, value in values.items() if name in self.names}
         found = read_scenario(self.source, self.folder, mine)
-        # Distributions of the file are sampled by the space.
+        # The space samples the distributions of the file.
         fields = {"distributions": {}, "drives_ego": False}
         board = found.board.model_copy(update=fields)
         return ScenarioFile(board, found.road_file, found.notes)
@@ -169,7 +169,7 @@ def read_scenario(
     """A scenario with values of its parameters.
 
     Raises:
-        ScenarioError: not a scenario, or with unsupported elements.
+        ScenarioError: not a scenario, or a scenario with unsupported elements.
         ValueError: an unknown parameter.
         OSError: the file cannot be read.
     """
@@ -239,7 +239,7 @@ def with_storyboard(
         scenes: folder of bundles, as for :func:`~.open_scene`.
 
     Raises:
-        CommandError: no such scenario, or one that cannot be a space; the message explains why.
+        CommandError: the scenario does not exist or cannot be a space; the message explains why.
         ValueError: invalid fields.
     """
     asked = fields["storyboard"]
@@ -274,7 +274,7 @@ def _name(file: str) -> str:
 def _parameters(given: Mapping[str, Any], found: ScenarioFile, file: str) -> dict[str, Any]:
     """Parameters named by the space, and other parameters with distributions in the file."""
     board = found.board
-    # The file may have any distribution for parameters that the space names itself.
+    # Parameters that the space names may have any distribution in the file.
     drawn = {n: d for n, d in board.distributions.items() if n not in given}
     parameters = {name: _parameter(name, d) for name, d in drawn.items()}
     parameters |= {n: p for n, p in _of_cases(found.cases).items() if n not in given}
@@ -354,12 +354,12 @@ SHIPPED_SPACES = Path(__file__).with_name("spaces")
 class Space(BaseModel):
     """A case and its varied parameters.
 
-    Used by a sweep, which drives points of it, and by a search, which selects them.
+    Sweeps drive sampled points of it; searches select points.
 
     Attributes:
-        case: as in a suite, with a scene.
-        parameters: by name.
-        storyboard: makes the storyboard of each point; None if the case has no storyboard, or a
+        case: case as in a suite, with a scene.
+        parameters: parameters by name.
+        storyboard: creates the storyboard of each point; None if the case has no storyboard, or a
             fixed one.
     """
 
@@ -424,7 +424,7 @@ class SweepSpec(Space):
     @model_validator(mode="after")
     def _check_points(self) -> Self:
         if isinstance(self.method, SpreadMethod) and self.method.count > 4096:
-            return self  # Names are valid already, and computing the points again takes time.
+            return self  # Names are already valid; computing the points again would take time.
         points_of(self.method, drawn_parameters(self.parameters))
         return self
 
@@ -451,7 +451,7 @@ def load_space(name: str | Path, scenes: Path | None = None) -> Space:
     Fields of a sweep beyond a space are ignored.
 
     Raises:
-        CommandError: as :func:`load_sweep`.
+        CommandError: see :func:`load_sweep`.
     """
     if is_scenario(str(name)):
         return _validated({"storyboard": str(name)}, Path(), Space, (str(name), "space"), scenes)
@@ -496,7 +496,7 @@ def _content(path: Path) -> dict[str, Any]:
     if (size := path.stat().st_size) > MAX_BYTES:
         raise ValueError(f"{size} bytes; at most {MAX_BYTES} are read")
     text = path.read_text(encoding="utf-8")
-    # Aliases let a small file expand to a huge one, and no sweep needs them.
+    # Aliases can expand a small file to a huge one, and no sweep needs them.
     if path.suffix != ".json" and any(
         isinstance(e, yaml.events.AliasEvent) for e in yaml.parse(text, yaml.SafeLoader)
     ):

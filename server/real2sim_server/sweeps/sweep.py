@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 # --- Journal -------------------------------------------------------------------------------------
 
-# Rows of episodes on disk, so that a sweep continues where it was killed.
+# Rows of episodes on disk, to resume a killed sweep.
 
 FORMAT = "real2sim-episodes 1"
 MAX_BYTES = 4 << 30
@@ -44,7 +44,7 @@ class Journal:
     """An append-only file with lines ``checksum key row``.
 
     If the program is killed during a write, the checksum of the last line is wrong and the line is
-    cut off. Other damaged lines are skipped, and their episodes driven again.
+    removed. Other damaged lines are skipped, and their episodes are driven again.
 
     Args:
         path: path of the file; created if missing.
@@ -80,7 +80,7 @@ class Journal:
 
     def add(self, key: str, row: Mapping[str, Any]) -> None:
         """Store a row durably: after the call returns, it survives a kill of the program."""
-        # Numbers are written as the shortest text that reads back to the same bits.
+        # Numbers are written as the shortest text that parses to the same bits.
         text = f"{key} {json.dumps(dict(row), separators=(',', ':'))}".encode()
         self._write(b"%08x %s\n" % (zlib.crc32(text), text))
         self.rows[key] = dict(row)
@@ -181,7 +181,7 @@ COLUMNS: Mapping[str, type] = {
     "impact_object": str,
     "impact_kind": str,
 }
-"""Measured columns of every episode; without wall-clock times, so that tables are comparable."""
+"""Measured columns of every episode, without wall-clock times, to keep tables comparable."""
 
 
 def recipe_of(scene: str, scenes: Path | None, metrics: Sequence[str] = ()) -> Recipe:
@@ -194,7 +194,7 @@ class EpisodeWorker:
 
     Args:
         scene, scenes: as for :func:`.spec.open_scene`.
-        metrics: scores that get columns.
+        metrics: scores to add as columns.
         threads: number of threads.
     """
 
@@ -243,7 +243,7 @@ def row_of(driven: Driven, metrics: Sequence[str] = ()) -> Row:
 
 
 def _impact(driven: Driven) -> Row:
-    """Columns of the first contact, if the episode ended with it."""
+    """Columns of the first contact, if it ended the episode."""
     assert driven.world is not None
     begun = [c for c in driven.world.instant.contacts if c.begun]
     if not begun:
@@ -304,7 +304,7 @@ def run_sweep(
     scenes: Path | None = None,
     on_progress: Report = lambda _stage, _done, _total: None,
 ) -> dict[str, Any]:
-    """Drive a sweep into a folder; episodes that are already there are not driven again.
+    """Drive a sweep and write it to a folder; episodes that are already there are skipped.
 
     The table depends only on the spec, the scene and the version, not on the executor, the order,
     or interruptions of the sweep.
@@ -313,11 +313,12 @@ def run_sweep(
         spec: the sweep.
         out: folder of ``episodes.parquet``, ``recordings/``, ``scenarios/`` and the journal.
         executor: runs the episodes.
-        scenes: folder of bundles; every worker finds it at the same path.
+        scenes: folder of bundles, at the same path for every worker.
         on_progress: called with (stage, done, all).
 
     Returns:
-        Figures: episodes, newly driven ones, collisions, at-fault ones; keys of the worst.
+        Figures: numbers of episodes, newly driven episodes, collisions and at-fault collisions, and
+        the keys of the worst episodes.
 
     Raises:
         CommandError: no such scene, planner, score or column.
@@ -461,7 +462,7 @@ def _worst(
 
 
 def _record(scene: Scene, drive: Drive, path: Path) -> None:
-    """Make a recording by driving the episode again: the same bits."""
+    """Create a recording by driving the episode again, with bit-identical results."""
     if not path.exists():
         driven = drive_episode(scene, drive, load_planner(drive.planner), keep_entries=True)
         save_recording(recording_of(scene, driven), path)

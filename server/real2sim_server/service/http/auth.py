@@ -31,7 +31,7 @@ FOREIGN_PAGE = 4403
 PAGES = ("/", "/ui", "/ui/", "/docs")
 """Pages that other sites may link to."""
 OWN = ("same-origin", "none")
-"""Values of Sec-Fetch-Site for our own pages, and for addresses typed by the user."""
+"""Values of Sec-Fetch-Site for the worker's own pages, and for addresses typed by the user."""
 
 
 class OwnPagesOnly:
@@ -81,7 +81,7 @@ def _refusal(scope: Scope, headers: Headers) -> str | None:
 
 
 def _is_link(scope: Scope, headers: Headers) -> bool:
-    """Whether the user follows a link to one of our pages in a top-level window."""
+    """Whether the user follows a link to a page of the worker in a top-level window."""
     return (
         scope["type"] == "http"
         and scope["method"] in ("GET", "HEAD")
@@ -166,7 +166,7 @@ def check_bind(host: str, token: object) -> None:
     """Refuse to listen on public interfaces without a token or a token file.
 
     Raises:
-        OpenBindError: with the remedy.
+        OpenBindError: the address is public; the message states the remedy.
     """
     if token or is_loopback(host):
         return
@@ -258,12 +258,12 @@ def account_of(scope: Scope) -> Account | None:
 
 
 def act_for(connection: HTTPConnection, account: Account) -> None:
-    """Make the running task work for ``account``.
+    """Charge the running task to ``account``.
 
     Raises:
-        RevokedError: its token has been removed.
-        OverLimitError: its request limit is reached.
-        ServiceError: FORBIDDEN: its role does not allow it.
+        RevokedError: the account's token has been removed.
+        OverLimitError: the account's request limit is reached.
+        ServiceError: FORBIDDEN: the account's role does not allow the request.
     """
     connection.scope[_ACCOUNT_KEY] = account
     check_role(connection, account.role, name=account.name)
@@ -274,7 +274,7 @@ def act_for(connection: HTTPConnection, account: Account) -> None:
 READING = frozenset({"GET", "HEAD", "OPTIONS"})
 
 _NEEDED: tuple[tuple[re.Pattern[str], Role], ...] = (
-    # The body selects the view; the call changes nothing.
+    # POST because the body selects the view; the call changes nothing.
     (re.compile(r"/v1/scenes/[^/]+/render"), "observe"),
     (re.compile(r"/v1/scenes(/.*)?"), "administer"),
     (re.compile(r"/v1/sessions(/.*)?"), "drive"),

@@ -131,7 +131,7 @@ def document_errors(operation: dict[str, Any]) -> None:
     for code in dict.fromkeys(_codes(operation)):
         by_status.setdefault(str(HTTP_STATUS[code]), []).append(code)
     for status, codes in by_status.items():
-        if status in responses:  # the operation says more about it
+        if status in responses:  # the operation describes it in more detail
             responses[status].setdefault("content", {})[PROBLEM_MEDIA_TYPE] = _content()
             continue
         told = "; ".join(f"`{code.value}`: {title_of(code).lower()}" for code in codes)
@@ -266,7 +266,7 @@ FILES = {"application/xml": "scenario.xosc"}
 """Sample upload file by media type."""
 
 SAMPLE_QUERY: dict[str, tuple[str, ...]] = {"sessions-create": ("scene",)}
-"""Query parameters to show in an operation's sample, although none is required."""
+"""Optional query parameters to show in an operation's sample."""
 
 TOKEN_OF = {WORKER_SCHEME: "$REAL2SIM_TOKEN", SESSION_SCHEME: "$SESSION_TOKEN"}
 """Shell variable with the token of each security scheme."""
@@ -275,9 +275,9 @@ _published: dict[str, Any] = {}
 
 
 def published(app: FastAPI) -> dict[str, Any]:
-    """The document, computed once per process: it does not depend on settings.
+    """The document, computed once per process because it does not depend on settings.
 
-    Computing it on a request would block the event loop for tenths of a second.
+    Computing it during a request would block the event loop for some tenths of a second.
     """
     if not _published:
         _published.update(document(app))

@@ -56,7 +56,7 @@ log = structlog.get_logger(__name__)
 
 
 class RequestContext:
-    """ASGI middleware, the outermost of ours.
+    """The outermost ASGI middleware of the worker.
 
     Takes the request id from ``X-Request-Id`` or creates one, returns it, and binds it and the
     client for logs. Also measures the request, answers HEAD as GET without a body, and sends
@@ -118,7 +118,7 @@ class RequestContext:
             await self._app(scope, receive, send_with_id)
         except Exception as error:
             failure = service_error(error, log_unexpected=True)
-            if status:  # the reply has begun; the server must cut it short
+            if status:  # the reply has begun; the server must abort it
                 raise
             response = problem_response(failure, path=scope["path"], request_id=request_id)
             await response(scope, receive, send_with_id)
@@ -229,9 +229,9 @@ class IdempotentRequest:
     """One request with its idempotency key.
 
     Attributes:
-        key: None if the client sent none; then nothing is stored.
-        secret: the key as sent; the store only has its hash, and seals replies with it.
-        replay: the stored reply; send it and do nothing else.
+        key: key of the client; None if it sent none, and then nothing is stored.
+        secret: the key as sent. The store has only its hash, and seals replies with it.
+        replay: the stored reply; if set, send it and skip the work.
     """
 
     key: str | None = None
@@ -255,7 +255,7 @@ class IdempotentRequest:
     def reply_bytes(
         self, content: bytes, *, status: int, headers: Mapping[str, str] | None = None
     ) -> StoredReply | None:
-        """The same for encoded JSON."""
+        """The same, for encoded JSON."""
         if self.key is None:
             return None
         body = sealed(content, self.secret)
@@ -263,7 +263,7 @@ class IdempotentRequest:
 
 
 class ReplyConflict(Exception):
-    """Another worker has answered the same request in the meantime; this attempt is discarded.
+    """Another worker has already answered the same request; this attempt is discarded.
 
     Args:
         answer: the other worker's reply.
@@ -297,12 +297,12 @@ class Idempotency:
         Args:
             request: the request.
             key: key of the client; None disables the guard.
-            content: identifies the body; None for the body itself. A form, whose boundary differs
-                each time, is identified by its parts: :func:`form_digest`.
+            content: identifies the body; None for the body itself. The boundary of a form varies,
+                so use :func:`form_digest` for forms.
 
         Raises:
             ServiceError: IDEMPOTENCY_CONFLICT if the key was used for another request.
-            ReplyConflict: another worker was faster.
+            ReplyConflict: another worker has already answered.
         """
         if key is None:
             yield IdempotentRequest()
@@ -342,7 +342,7 @@ class Idempotency:
     async def store(self, reply: StoredReply | None) -> None:
         """Store the reply of an effect outside the store, after the effect.
 
-        A crash in between leaves only the effect, so the effect carries the claim of its request.
+        A crash in between leaves only the effect; the effect therefore carries the request's claim.
         """
         if reply is not None:
             await self._store.write(reply=reply)

@@ -84,8 +84,8 @@ def uncancellable(
 ) -> Callable[P, Coroutine[Any, Any, T]]:
     """A coroutine function that runs to completion even if its caller is cancelled.
 
-    For changes that are stored before they take effect in memory: one without the other would make
-    every later change fail. The caller waits, and holds its locks.
+    Use it for changes that are stored before they take effect in memory. If only one of the two
+    happened, every later change would fail. The caller waits and keeps its locks.
     """
 
     @functools.wraps(method)
@@ -115,7 +115,7 @@ class ServiceError(Exception):
         detail: the given value and the allowed ones; sent to the client.
         hint: how to fix it.
         errors: invalid values by JSON pointer.
-        extra: further members of the problem document.
+        extra: additional members of the problem document.
         headers: headers of the reply.
     """
 
@@ -168,7 +168,7 @@ _KINDS: tuple[tuple[type[Exception], ErrorCode, str | None], ...] = (
 
 
 def service_error(error: Exception, *, log_unexpected: bool = False) -> ServiceError:
-    """The error for clients. Unexpected ones become INTERNAL and reveal nothing."""
+    """The error for clients. Unexpected errors become INTERNAL, without details."""
     failure = _translated(error)
     if log_unexpected and failure.code is ErrorCode.INTERNAL:
         log.error("unexpected error", exc_info=error)
@@ -226,7 +226,7 @@ def _of_shortage(error: Exception) -> ServiceError | None:
         log.error("files in trouble", reason=str(error))
         detail = f"the worker's files cannot be used just now: {error.strerror}"
         return ServiceError(ErrorCode.STORAGE_UNAVAILABLE, detail, hint=_AGAIN)
-    # Compare torch's class by name, so that this module does not import torch.
+    # Compare torch's class by name to avoid importing torch.
     if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":
         return ServiceError(
             ErrorCode.OUT_OF_MEMORY,
@@ -275,7 +275,7 @@ def install_problem_handlers(app: FastAPI) -> None:
     """Answer every error of ``app`` with a problem document."""
 
     async def closed(_request: Request, _error: Exception) -> Response:
-        # Never sent; proxies log this number.
+        # The client never receives it; proxies log this status.
         return Response(status_code=499)
 
     for gone in (ClientDisconnectedError, ClientDisconnect):
@@ -420,7 +420,7 @@ def choose_among(offered: Sequence[str], accept: str | None, *, of: str) -> str:
 def info_response(
     body: BaseModel, *, status: int = 200, headers: Mapping[str, str] | None = None
 ) -> Response:
-    """A reply with a model that was created here and needs no second validation."""
+    """A reply with a model that needs no second validation."""
     return Response(
         body.model_dump_json(),
         status_code=status,
@@ -437,8 +437,8 @@ async def large_response(
 ) -> Response:
     """A reply with a large model, built and encoded on another thread.
 
-    It is encoded in parts: one call for all of a scene's trajectories would hold the GIL for tens
-    of milliseconds and block the event loop.
+    It is encoded in parts. One call for all trajectories of a scene would hold the GIL for tens of
+    milliseconds and block the event loop.
     """
     content = await asyncio.to_thread(lambda: json_in_pieces(build()))
     return Response(content, status, dict(headers or {}), "application/json")
@@ -492,7 +492,7 @@ HEARTBEAT_S = 10.0
 
 
 async def event_stream(events: AsyncIterator[tuple[int, str, str]]) -> AsyncIterator[bytes]:
-    """The bytes of (id, name, data without line breaks), with heartbeats in between."""
+    """An event stream of (id, name, data without line breaks), with heartbeats in between."""
     source = aiter(events)
     pending: asyncio.Future[tuple[int, str, str]] | None = None
     try:

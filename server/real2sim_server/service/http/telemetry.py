@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 # --- Metrics --------------------------------------------------------------------------------------
 
-# Label values come from closed sets, never from client text or ids.
+# Label values are from closed sets, never client text or ids.
 
 FAST_BUCKETS = (0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2.5, 5, 10)
 LOAD_BUCKETS = (0.05, 0.1, 0.25, 0.5, 1, 2.5, 5, 10, 30, 60, 120)
@@ -38,7 +38,7 @@ OTHER = "other"
 
 
 class Metrics:
-    """All metrics, in a separate registry, so that one process can run several workers."""
+    """All metrics of a worker, in a separate registry because a process can run several workers."""
 
     def __init__(self) -> None:
         registry = self.registry = CollectorRegistry()
@@ -173,7 +173,7 @@ class Metrics:
             self.store_failures.labels(call).inc()
 
     def observe_ended_job(self, kind: str, state: str) -> None:
-        """Record an ended job."""
+        """Record a finished job."""
         self.ended_jobs.labels(kind, state).inc()
 
     def observe_request(self, method: str, route: str, status: int, seconds: float) -> None:
@@ -215,7 +215,7 @@ class Durations:
         self.total = 0.0
 
     def observe(self, seconds: float) -> None:
-        """Count one."""
+        """Count one duration."""
         self.counts[bisect_left(self._bounds, seconds)] += 1
         self.total += seconds
 
@@ -225,8 +225,8 @@ class LoopHistogram(Collector):
     the client library's histogram it is ten times faster.
 
     Args:
-        name, text: as for any metric.
-        label: name of its label; None for none.
+        name, text: name and help text of the metric.
+        label: name of its label, or None.
         buckets: upper bounds, increasing [s].
         registry: registry of the metric.
     """
@@ -266,7 +266,7 @@ class LoopHistogram(Collector):
         return [HistogramMetricFamily(self._name, self._text, labels=self._labels)]
 
     def collect(self) -> Iterable[Metric]:
-        """Every series, on the thread that exposes metrics."""
+        """Collect every series, on the thread that exposes metrics."""
         family = HistogramMetricFamily(self._name, self._text, labels=self._labels)
         bounds = [*map(floatToGoString, self._bounds), "+Inf"]
         for value, durations in list(self._series.items()):
@@ -276,7 +276,7 @@ class LoopHistogram(Collector):
 
 
 class _AccountCollector:
-    """Account metrics, read at collection, so that accounts do not depend on metrics."""
+    """Account metrics, read at collection; accounts do not depend on metrics."""
 
     def __init__(
         self, accounts: Iterable[Account], sessions: Callable[[], Mapping[str, int]]
@@ -289,7 +289,7 @@ class _AccountCollector:
         return [CounterMetricFamily(name, text, labels=["token"]) for name, text, _ in _FIGURES]
 
     def collect(self) -> Iterator[Metric]:
-        """Every figure with a sample for each name."""
+        """Every metric, with one sample per account name."""
         accounts = list(self._accounts)
         for name, text, read in _FIGURES:
             family = CounterMetricFamily(name, text, labels=["token"])

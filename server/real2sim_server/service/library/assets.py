@@ -62,7 +62,7 @@ class LibraryAsset:
 
     @property
     def nbytes(self) -> int:
-        """Memory of its Gaussians, including relit copies for scenes [bytes]."""
+        """Memory of the Gaussians, including relit copies for scenes [bytes]."""
         with self._lock:
             clouds = [self.asset.cloud, *self._lit.values()]
         # Relit clouds share all tensors except colours.
@@ -71,7 +71,7 @@ class LibraryAsset:
 
     @property
     def asset_id(self) -> str:
-        """Its name in the library."""
+        """Id of the asset in the library."""
         return self.asset.asset_id
 
     @property
@@ -101,12 +101,12 @@ class LibraryAsset:
 
     @property
     def ambient(self) -> Colour | None:
-        """Mean colour of its original surroundings."""
+        """Mean colour of the asset's original surroundings."""
         given = self.asset.provenance.get("ambient")
         return tuple(given) if given is not None else None
 
     def cloud_in(self, scene: Scene) -> GaussianCloud:
-        """Its Gaussians relit for ``scene``, on the scene's device."""
+        """The asset's Gaussians, relit for ``scene``, on the scene's device."""
         found = self._lit.get(scene)
         if found is None:
             cloud = self.asset.cloud.to(scene.background.device)
@@ -119,8 +119,8 @@ class LibraryAsset:
 class AssetLibrary:
     """The assets in a folder. Thread-safe; reading and writing are slow.
 
-    The most recently used assets stay in memory while the budget allows. An asset in use by a
-    scenario stays in memory with the scenario, and counts.
+    The most recently used assets stay in memory while the budget allows. An asset used by a
+    scenario stays in memory with the scenario and counts towards the budget.
 
     Args:
         folder: folder of asset bundles; it need not exist.
@@ -156,14 +156,14 @@ class AssetLibrary:
         return _info(summary)
 
     def find(self, asset_id: str) -> LibraryAsset | None:
-        """The asset of that id, read from disk if it is not in memory.
+        """The asset with an id, read from disk if it is not in memory.
 
         Raises:
             ServiceError: OUT_OF_MEMORY.
         """
         if (known := self._in_memory(asset_id)) is not None:
             return known
-        # One at a time: a second reader of the same asset finds it in memory.
+        # One read at a time: a second request for the same asset finds it in memory.
         with self._loading:
             if (known := self._in_memory(asset_id)) is not None:
                 return known
@@ -171,7 +171,7 @@ class AssetLibrary:
             return self._load(asset_id, summary) if summary is not None else None
 
     def get(self, asset_id: str) -> LibraryAsset:
-        """The asset of that id. Raises ServiceError: UNKNOWN_ASSET, OUT_OF_MEMORY."""
+        """The asset with an id. Raises ServiceError: UNKNOWN_ASSET, OUT_OF_MEMORY."""
         found = self.find(asset_id)
         if found is None:
             raise _unknown(asset_id)
@@ -184,7 +184,7 @@ class AssetLibrary:
             return self._reserved + sum(asset.nbytes for asset in self._alive.values())
 
     def idle(self) -> Sequence[IdleItem]:
-        """Cached assets. Dropping one that a scenario uses frees no memory."""
+        """Cached assets. Dropping an asset that a scenario uses frees no memory."""
         with self._lock:
             return [
                 IdleItem(used_at, self._strong[asset_id].nbytes, partial(self._drop, asset_id))
@@ -312,7 +312,7 @@ class AssetLibrary:
             asset = self._strong.pop(asset_id, None)
             self._kept.pop(asset_id, None)
             nbytes = asset.nbytes if asset is not None else 0
-            # The last reference in this function; other references keep the asset alive.
+            # This is the last reference in this function; any other keeps the asset alive.
             asset = None
             return 0 if asset_id in self._alive else nbytes
 
@@ -374,7 +374,7 @@ def import_asset(
     quota: Quota,
     claim: str | None = None,
 ) -> AssetInfo:
-    """Import an asset from a splat file: upright, centred and at a real size.
+    """Import an asset from a splat file; turn it upright, centre it and scale it to real size.
 
     Args:
         library: the target library.

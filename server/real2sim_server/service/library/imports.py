@@ -33,9 +33,9 @@ from .scenes import SCENE_DOCUMENT, Quota, bundle_folder, folder_usage
 
 # --- Claims --------------------------------------------------------------------------------------
 
-# Files and answers cannot be stored together. A new bundle therefore carries a claim of its request
-# until the answer is stored: after a crash the repeated request recognises its own bundle, and any
-# other request finds the name taken.
+# A file and a reply cannot be stored atomically. A new bundle therefore carries the claim of its
+# request until the reply is stored. After a crash, the repeated request recognises its bundle by
+# the claim, and for any other request the name is taken.
 
 CLAIM_FILE = ".made_by"
 
@@ -47,7 +47,7 @@ def put_claim(bundle: Path, claim: str | None) -> None:
 
 
 def has_claim(bundle: Path, claim: str | None) -> bool:
-    """Whether the bundle exists and comes from that request, whose reply was not stored."""
+    """Whether the bundle exists and was created by that request, without a stored reply."""
     try:
         return claim is not None and (bundle / CLAIM_FILE).read_text(encoding="utf-8") == claim
     except (OSError, ValueError):
@@ -142,7 +142,7 @@ def staging_folder(beside: Path) -> Iterator[Path]:
 
 @contextmanager
 def import_errors(source: Path, *, setting: str) -> Iterator[None]:
-    """Convert errors of the block for clients.
+    """Convert errors of the block into errors for clients.
 
     Args:
         source: imported file; messages omit its path on this machine.
@@ -150,7 +150,7 @@ def import_errors(source: Path, *, setting: str) -> Iterator[None]:
 
     Raises:
         ServiceError: IMPORT_FAILED or PAYLOAD_TOO_LARGE.
-        OSError: the worker's disk is full or fails, which is not the file's fault.
+        OSError: the worker's disk is full or fails.
     """
     try:
         yield
@@ -175,7 +175,7 @@ def import_errors(source: Path, *, setting: str) -> Iterator[None]:
 def _raise_of_disk(error: StagingError) -> None:
     """Raise the system's error if the disk is full or missing.
 
-    The reading process has its own file size limit; exceeding it is the file's fault.
+    Exceeding the file size limit of the reading process is an error of the imported file.
     """
     for number in (FULL_ERRNOS | REFUSED_ERRNOS) - {errno.EFBIG}:
         if str(error) == os.strerror(number):
@@ -242,12 +242,12 @@ class ImportQueue:
         self._taken = 0
 
     def close(self) -> None:
-        """Start no further imports."""
+        """Stop starting imports."""
         self._thread.shutdown(wait=False, cancel_futures=True)
 
     @contextmanager
     def place(self) -> Iterator[None]:
-        """A place in the queue, taken before the upload is received.
+        """Reserve a place in the queue before the upload is received.
 
         Raises:
             ServiceError: QUEUE_FULL.
@@ -265,5 +265,5 @@ class ImportQueue:
             self._taken -= 1
 
     async def run(self, work: Callable[[], T]) -> T:
-        """``work()`` after all earlier imports."""
+        """Run ``work()`` after all earlier imports."""
         return await asyncio.get_running_loop().run_in_executor(self._thread, work)

@@ -37,8 +37,8 @@ class IdleItem:
 
     Attributes:
         used_at: time of the last use, monotonic clock [s].
-        nbytes: its size.
-        drop: drops it; returns the bytes that become free, immediately or shortly after.
+        nbytes: size of the item.
+        drop: drops the item; returns the bytes that become free, immediately or soon.
     """
 
     used_at: float
@@ -84,7 +84,8 @@ class MemoryBudget:
         Args:
             what: name for messages, such as ``scene 'street'``.
             needed: bytes.
-            reserve: makes its holder count them; called before another call can use the space.
+            reserve: makes the holder count these bytes; called before another caller can use the
+                space.
 
         Raises:
             ServiceError: OUT_OF_MEMORY.
@@ -151,7 +152,7 @@ class Quota:
 
         Args:
             added_bytes: size of the new entry, if known.
-            entries: number of entries, if not to be counted in the folder.
+            entries: number of entries; default: counted in the folder.
 
         Raises:
             ServiceError: QUOTA_EXCEEDED.
@@ -188,7 +189,7 @@ def _size(entry: os.DirEntry[str]) -> int:
         if entry.is_dir(follow_symlinks=False):
             return sum(map(_size, _scan(entry.path)))
         return entry.stat(follow_symlinks=False).st_size
-    except OSError:  # it was removed meanwhile
+    except OSError:  # it has been removed in the meantime
         return 0
 
 
@@ -302,7 +303,7 @@ def bundle_folder(folder: Path, name: str) -> Path:
 
 
 def _fingerprint(path: Path) -> Fingerprint:
-    """Names, sizes and times of the files; changes with the bundle. Hidden files are excluded."""
+    """Names, sizes and times of a bundle's files, to detect changes. Hidden files are excluded."""
     try:
         entries = sorted(p for p in path.iterdir() if not p.name.startswith("."))
         stats = [(p.name, p.stat()) for p in entries]
@@ -338,8 +339,8 @@ class _Resident:
 class SceneCache:
     """Scenes of the scene folder, loaded on demand and evicted if memory is short.
 
-    All users share one scene object. A session pins its scene; unpinned scenes are evicted least
-    recently used first. All methods are for the event loop, except where noted.
+    All users share one scene object. A session pins its scene; unpinned scenes are evicted in
+    least-recently-used order. Call methods on the event loop, except where noted.
 
     Args:
         catalog: the scene folder.
@@ -349,7 +350,7 @@ class SceneCache:
         on_load: called with the duration of each load [s].
 
     Attributes:
-        fetch: fetches a missing scene from elsewhere; returns whether there was one.
+        fetch: fetches a missing scene from another worker; returns whether it exists.
     """
 
     def __init__(
@@ -371,8 +372,8 @@ class SceneCache:
         self._resident: dict[str, _Resident] = {}
         self._loading: dict[str, asyncio.Task[Scene]] = {}
         self._reserved: dict[str, int] = {}
-        # Reading and hashing bundles is disk work; it would block sessions on the engine, and all
-        # requests on the event loop. One thread, because disks and memory serve one reader best.
+        # Reading and hashing bundles would block sessions on the engine, and all requests on the
+        # event loop. One thread, because disks and memory are fastest with one reader.
         self._loop: asyncio.AbstractEventLoop | None = None
         self._loop_thread = 0
         budget.add(self)
@@ -384,7 +385,7 @@ class SceneCache:
         self._resident.clear()
 
     async def on_disk_thread(self, fn: Callable[[], T]) -> T:
-        """``fn()`` on the thread that reads and writes bundles."""
+        """Run ``fn()`` on the thread that reads and writes bundles."""
         return await asyncio.get_running_loop().run_in_executor(self._disk, fn)
 
     # --- queries ----------------------------------------------------------------------------
@@ -395,7 +396,7 @@ class SceneCache:
         return self._listings
 
     async def listing(self, name: str) -> Listing:
-        """The bundle of that name.
+        """The bundle with that name.
 
         Raises:
             ServiceError: UNKNOWN_SCENE, with the available names.
@@ -415,9 +416,9 @@ class SceneCache:
         return known
 
     async def summary(self, name: str) -> SceneSummary:
-        """Summary of a scene: of the one in memory, else of the bundle on disk.
+        """Summary of a scene, from memory if it is loaded, else from the bundle on disk.
 
-        A bundle that was replaced on disk applies from the next load.
+        A bundle that was replaced on disk takes effect at the next load.
 
         Raises:
             ServiceError: UNKNOWN_SCENE or SCENE_BROKEN.
@@ -426,7 +427,7 @@ class SceneCache:
             return resident.summary
         listing = await self.listing(name)
         if listing.summary is None:
-            # It may have been repaired since.
+            # The bundle may have been repaired since.
             listing = (await self.refresh()).get(name, listing)
         if listing.summary is None:
             raise _broken(name, listing.reason)
@@ -507,7 +508,7 @@ class SceneCache:
             self.unpin(name)
 
     async def unload(self, name: str) -> None:
-        """Remove the scene from memory; no effect if it is not there.
+        """Remove the scene from memory; no effect if it is not loaded.
 
         Raises:
             ServiceError: UNKNOWN_SCENE, or SCENE_IN_USE while sessions pin it.
@@ -544,7 +545,7 @@ class SceneCache:
                 # Retrieve the outcome even if all waiters have left.
                 task.add_done_callback(lambda t: t.cancelled() or t.exception())
                 self._loading[name] = task
-            # Others may wait for the same load; one that leaves must not cancel it.
+            # Others may wait for the same load; a cancelled waiter must not cancel it.
             await asyncio.shield(task)
         resident.used_at = time.monotonic()
         return resident

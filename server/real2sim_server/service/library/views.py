@@ -126,8 +126,8 @@ def camera_infos(cameras: Sequence[Camera]) -> list[CameraInfo]:
 
 def track(trajectory: Trajectory) -> Track:
     """A trajectory as a protocol model."""
-    # The trajectory is already validated; validating thousands of poses again would block the event
-    # loop.
+    # Skip validation: the trajectory is valid, and validating thousands of poses would block the
+    # event loop.
     return Track.model_construct(
         times_us=trajectory.times_us.tolist(),
         positions=[tuple(p) for p in trajectory.positions.tolist()],
@@ -149,10 +149,10 @@ class SplatFiles:
     """Parts of clouds as spz files, sorted by decreasing coverage, with a least-recently-used
     cache.
 
-    Thread-safe. Work is serialized, because two requests for one cloud would repeat its sorting.
+    Thread-safe. Work is serialized, because concurrent requests would sort the same cloud twice.
 
     Args:
-        most_bytes: size limit of the cache: orders and files.
+        most_bytes: size limit of the cache of orders and files.
     """
 
     def __init__(self, *, most_bytes: int = MAX_BYTES) -> None:
@@ -171,7 +171,7 @@ class SplatFiles:
 
         Args:
             cloud: all Gaussians.
-            known: key of the content of ``cloud``; different content has a different key.
+            known: cache key of the content of ``cloud``.
             first: number of Gaussians to skip.
             count: maximum number.
         """

@@ -133,7 +133,7 @@ async def delete(
     if dry_run:
         return Response(status_code=204)
     with worker.assets.removing(asset_id):
-        # Again: an edit in progress may have found it before.
+        # Check again: an edit in progress may have looked the asset up before.
         await _check_unused(worker, asset_id)
         if worker.sharing is not None:
             await worker.sharing.forget("asset", asset_id)

@@ -245,7 +245,7 @@ async def _work(
 
 
 def _is_portable(body: ExportRequest | DatasetRequest) -> bool:
-    """Whether all its inputs are in the store, and the same for all workers."""
+    """Whether all inputs are in the store and identical for all workers."""
     if isinstance(body, DatasetRequest):
         return body.session is None and body.recording is None
     return body.simulation is None
@@ -339,7 +339,7 @@ async def _edited_source(
 
 
 def _made_of(entries: list[dict[str, Any]]) -> dict[str, Any]:
-    """A scenario's history without timestamps, so that equal edits give equal bytes."""
+    """A scenario's history without timestamps: equal edits give equal bytes."""
     if all(entry["kind"] == "edit" for entry in entries):
         return {"operations": [edit for entry in entries for edit in entry["operations"]]}
     kept = ("kind", "operations", "target")
@@ -348,7 +348,7 @@ def _made_of(entries: list[dict[str, Any]]) -> dict[str, Any]:
 
 async def _session_source(worker: Worker, session_id: str, request: Request) -> DatasetSource:
     row = check_not_closed(await worker.sessions.row(session_id))
-    # If the worker requires a token, the route has checked one: it opens every session.
+    # If the worker requires a token, the route has checked it; it gives access to every session.
     if not worker.accounts.needs_token and not opens_session(bearer_token(request), row):
         error = unauthorized("the data set of a session wants the session's token")
         error.hint = "send 'Authorization: Bearer <token>'; POST /v1/sessions gave the token"

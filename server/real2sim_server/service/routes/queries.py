@@ -64,7 +64,7 @@ class FrameQuery:
         media_type: str,
         T_world_vehicle: Float | None = None,
     ) -> RenderRequest:
-        """Render request for given instances, and another path of the vehicle."""
+        """Render request for the given instances and another path of the vehicle."""
         sensor = SensorSpec(
             camera=self.camera or scene.rig.names[0],
             modalities=[self.modality],

@@ -324,7 +324,7 @@ def _import(worker: Worker, source: Path, name: str, claim: str | None) -> None:
 
 
 def stored_upload(file: UploadFile, staging: Path) -> Path:
-    """The upload as a file in ``staging``: readers map files, and some formats need the suffix."""
+    """Write the upload to ``staging``: readers map files, and some formats need the suffix."""
     given = Path(file.filename or "upload.ply").name.lower()
     ending = next((suffix for suffix in suffixes() if given.endswith(suffix)), ".ply")
     stored = staging / f"upload{ending}"
@@ -341,7 +341,7 @@ def _parse(body: bytes) -> SceneImport:
         raise RequestValidationError(found) from error
 
 
-# Gaussians and skies of scenes and objects, for renderers elsewhere.
+# Gaussians and skies of scenes and objects, for external renderers.
 
 # --- Scenes --------------------------------------------------------------------------------------
 

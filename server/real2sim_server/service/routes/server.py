@@ -188,7 +188,7 @@ async def file(name: str) -> Response:
     return Response(path.read_bytes(), media_type=MEDIA_TYPES[path.suffix], headers=headers)
 
 
-# Listed once: request paths are looked up, never joined to a folder.
+# Files are listed once. Request paths are looked up here and never joined to a folder.
 STUDIO = {
     p.relative_to(FOLDER).as_posix(): p
     for p in sorted(FOLDER.rglob("*"))

@@ -94,7 +94,7 @@ async def _check_session_token(request: Request, session_id: str) -> None:
         return
     row = None
     if given is not None or not accounts.needs_token:
-        # The row is sufficient: no session is rebuilt for unauthorised requests.
+        # Check the row only, to avoid rebuilding sessions for unauthorised requests.
         row = check_not_closed(await worker.sessions.row(session_id))
     if row is None or not opens_session(given, row):
         worker.metrics.auth_failures.labels("http").inc()
@@ -383,7 +383,7 @@ async def render(
 
 
 def _state_reply(session: Session, idempotent: IdempotentRequest) -> MakeReply:
-    """The reply to store under a request's key after the world has moved."""
+    """The reply to store under a request's key after the step."""
 
     def reply(world: World, events: Sequence[Event]) -> StoredReply | None:
         if idempotent.key is None:
@@ -412,7 +412,7 @@ async def view_response(
     """All frames and clouds as msgpack; a single image also as a file, if ``accept`` prefers
     that.
 
-    In msgpack each frame has the codec its sensor names.
+    In msgpack, each frame has the codec of its sensor.
 
     Raises:
         ServiceError: NOT_ACCEPTABLE, or as StepPipeline.view().

@@ -85,7 +85,7 @@ async def drive(socket: WebSocket, worker: WorkerOf, session_id: str) -> None:
 async def _serve_drive(
     socket: WebSocket, worker: Worker, row: SessionRow, account: Account | None
 ) -> None:
-    """Hello, the session, then its messages."""
+    """Process hello, open the session, then process its messages."""
     hello = await receive_hello(
         socket,
         row,
@@ -137,7 +137,7 @@ def common_protocol(socket: WebSocket) -> str:
 
 
 def account_of_handshake(socket: WebSocket, worker: Worker) -> Account | None:
-    """The account of the worker's token in the handshake; hello may have one instead.
+    """The account of the worker's token in the handshake; hello may send the token instead.
 
     Raises:
         ServiceError: UNAUTHORIZED for a wrong token.
@@ -169,7 +169,7 @@ def ended_when_revoked(connection: Connection, account: Account) -> Iterator[Non
 
 
 def _end(connection: Connection, account: Account) -> None:
-    """Disconnect a client whose token was removed; not awaited, because it may read slowly."""
+    """Disconnect a client whose token was removed, without waiting for a slow reader."""
     ending = asyncio.ensure_future(connection.end(service_error(RevokedError(account.name))))
     _ending.add(ending)
     ending.add_done_callback(_ending.discard)
@@ -197,7 +197,7 @@ class ViewRequest(Model):
         seq: returned with the answer.
         T_world_camera: 16 values, row-major: a free camera with the intrinsics of ``camera``;
             None for the recorded pose.
-        operations: applied to this picture only: preview of an unfinished edit.
+        operations: applied to this picture only, to preview an unfinished edit.
         job: finished simulation to show instead of the scenario.
         shows: modality of the picture; ``uncertainty`` is coloured, see uncertainty_picture.
         pick: (across, down) in fractions of the picture: query the object there instead.
@@ -234,7 +234,7 @@ class ViewConnection:
         self._revoked = asyncio.Event()
 
     def end(self) -> None:
-        """Disconnect the browser: its token was removed."""
+        """Disconnect the browser after its token was removed."""
         self._revoked.set()
 
     async def serve(self) -> None:
@@ -247,7 +247,7 @@ class ViewConnection:
         finally:
             for task in tasks:
                 task.cancel()
-            # Not gather(): if cancelled itself, it would pass the cancellation to its tasks.
+            # Not gather(): if it is cancelled, it cancels its tasks.
             await asyncio.wait(tasks)
         for task in tasks:
             error = None if task.cancelled() else task.exception()
@@ -365,7 +365,7 @@ class ViewConnection:
 
 
 def instance_at(ids: NDArray[np.uint16], place: tuple[float, float], *, reach: int = 3) -> int:
-    """Id of the object under a pointer; near its edge the object, not the background.
+    """Id of the object under a pointer; near an edge, the object takes precedence.
 
     Args:
         ids: [H, W] instance image.
@@ -431,7 +431,7 @@ CLOSED_BY = {
     ErrorCode.TOO_MANY_REQUESTS: CLOSED_OVER_LIMIT,
 }
 
-# Not json.loads(): deep nesting overflows its stack, and it accepts lone surrogates.
+# Not json.loads(): it overflows its stack on deep nesting and accepts lone surrogates.
 _HELLO: TypeAdapter[dict[str, object]] = TypeAdapter(dict[str, object])
 
 

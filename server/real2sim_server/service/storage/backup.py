@@ -48,7 +48,7 @@ class BackupInfo:
         made_by: version of this program.
         schema: schema version of the database.
         sha256: hash of the database.
-        assets: its bundles.
+        assets: asset bundles in the backup.
     """
 
     format: int
@@ -60,7 +60,7 @@ class BackupInfo:
 
 
 def make_backup(database: Path, assets: Path, out: Path) -> BackupInfo:
-    """Copy a store to a file, also while a worker writes to it: the copy is a consistent snapshot.
+    """Copy a consistent snapshot of a store to a file, even while a worker writes to it.
 
     Args:
         database: SQLite file.
@@ -68,7 +68,7 @@ def make_backup(database: Path, assets: Path, out: Path) -> BackupInfo:
         out: new tar file; must not exist.
 
     Raises:
-        BackupError: there is no such database, or the copy is damaged.
+        BackupError: the database does not exist, or the copy is damaged.
         OSError: ``out`` cannot be written.
     """
     if not database.is_file():
@@ -76,7 +76,7 @@ def make_backup(database: Path, assets: Path, out: Path) -> BackupInfo:
     with tempfile.TemporaryDirectory(prefix=".backup-", dir=out.parent) as folder:
         copy = Path(folder) / DATABASE
         _copy_database(database, copy)
-        # After the database: its assets already exist, and never change.
+        # Assets follow the database: those it refers to already exist and never change.
         bundles = [path for path in sorted(assets.glob("[!.]*")) if path.is_dir()]
         info = BackupInfo(
             format=FORMAT,
@@ -95,7 +95,7 @@ def make_backup(database: Path, assets: Path, out: Path) -> BackupInfo:
         packed.chmod(0o600)
         with packed.open("rb") as file:
             os.fsync(file.fileno())
-        # Never overwrites a file created meanwhile.
+        # This does not overwrite a file that was created in the meantime.
         os.link(packed, out)
     return info
 
@@ -104,7 +104,7 @@ def restore_backup(file: Path, data: Path, *, database: Path, assets: Path, repl
     """Restore a backup; an existing store is moved aside.
 
     Args:
-        file: made by :func:`make_backup`.
+        file: file written by :func:`make_backup`.
         data: state folder, not in use by a worker.
         database: SQLite file to create.
         assets: folder that receives missing bundles.
@@ -114,7 +114,7 @@ def restore_backup(file: Path, data: Path, *, database: Path, assets: Path, repl
         The new path of the old store; ``database`` if there was none.
 
     Raises:
-        BackupError: it is not a backup, damaged, or too new; or there is already a store.
+        BackupError: the file is not a backup, damaged or too new, or a store already exists.
         StateFolderError: a worker uses the state folder.
         OSError: a file cannot be written.
     """
@@ -145,7 +145,7 @@ def _copy_database(source: Path, target: Path) -> None:
         contextlib.closing(sqlite3.connect(target)) as writing,
     ):
         try:
-            # In one step, so that it finishes even while a worker writes; writers need not wait.
+            # Copying in one step finishes even while a worker writes, and does not block writers.
             reading.backup(writing, pages=-1)
             writing.execute("PRAGMA journal_mode=DELETE")
         except sqlite3.Error as error:
@@ -153,7 +153,7 @@ def _copy_database(source: Path, target: Path) -> None:
 
 
 def _checked_schema(database: Path) -> int:
-    """Schema version of a copy. Raises BackupError: it is damaged."""
+    """Schema version of a copy. Raises BackupError if the copy is damaged."""
     with contextlib.closing(sqlite3.connect(database)) as connection:
         try:
             (state,) = connection.execute("PRAGMA quick_check(1)").fetchone()

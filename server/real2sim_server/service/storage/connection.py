@@ -168,7 +168,7 @@ def _has_little_space(folder: Path) -> bool:
 
 _KINDS_OF_STATES: tuple[tuple[tuple[str, ...], type[StoreTroubleError]], ...] = (
     (("53100",), StoreFullError),
-    # A read-only standby server, for example.
+    # For example a read-only standby server.
     (("25006",), StoreReadOnlyError),
     # Deadlocks and similar conflicts, and timeouts of locks and statements.
     (("40", "55P03", "57014"), StoreBusyError),
@@ -183,7 +183,7 @@ def _of_server(error: SQLAlchemyError, cause: BaseException) -> StoreError | Non
         kinds = (kind for states, kind in _KINDS_OF_STATES if state.startswith(states))
         found = next(kinds, None)
         return found(_why(cause)) if found is not None else None
-    # Without a state the error is not from the server: it is down or unreachable.
+    # An error without a state is not from the server: the server is down or unreachable.
     broken = ("OperationalError", "InterfaceError", "TimeoutError", "PendingRollbackError")
     if type(error).__name__ in broken or getattr(error, "connection_invalidated", False):
         return StoreUnavailableError(_why(cause))
@@ -191,7 +191,7 @@ def _of_server(error: SQLAlchemyError, cause: BaseException) -> StoreError | Non
 
 
 def _sqlstate(error: BaseException) -> str:
-    """SQLSTATE of a server's error, from any driver; empty if there is none."""
+    """SQLSTATE of a server's error, from any driver; empty if it has none."""
     first = error.args[0] if error.args else None
     if isinstance(first, dict):
         return str(first.get("C", ""))
@@ -206,8 +206,8 @@ def _why(error: BaseException) -> str:
 
 
 DRIVER_TIMEOUTS = {"pg8000": "timeout", "psycopg": "connect_timeout", "psycopg2": "connect_timeout"}
-"""Timeout argument of each PostgreSQL driver [s]. Only pg8000 also limits reads, so that a frozen
-server is detected."""
+"""Timeout argument of each PostgreSQL driver [s]. Only pg8000 also limits reads, which detects a
+frozen server."""
 
 RETRY_S = 0.01
 """Interval of attempts to switch the journal of an SQLite database [s]."""
@@ -228,7 +228,7 @@ def connect(url: str, *, timeout_s: float) -> sa.Engine:
         return _server_engine(parsed, timeout_s)
     file = file_of(url)
     if file is None:
-        # An in-memory database belongs to its connection, which all threads share.
+        # An in-memory database belongs to its connection; all threads share it.
         other_threads = {"check_same_thread": False}
         engine = sa.create_engine(parsed, poolclass=StaticPool, connect_args=other_threads)
     else:
@@ -243,7 +243,7 @@ def connect(url: str, *, timeout_s: float) -> sa.Engine:
             # Incremental vacuum must be enabled before the first table is created.
             cursor.execute("PRAGMA auto_vacuum=INCREMENTAL")
         keep_write_ahead_journal(cursor, timeout_s)
-        # The rollback data of a statement needs no file.
+        # Keep the rollback data of statements in memory.
         for pragma in ("synchronous=NORMAL", "foreign_keys=ON", "temp_store=MEMORY"):
             cursor.execute(f"PRAGMA {pragma}")
         cursor.execute(f"PRAGMA busy_timeout={round(timeout_s * 1000)}")
@@ -331,7 +331,7 @@ def _connect_by_own_socket(
     """A pg8000 connection; closes its socket if connecting fails. pg8000 leaves it open if a server
     accepts connections but does not answer."""
     if {"sock", "unix_sock", "source_address"} & parameters.keys():
-        return None  # by the driver itself
+        return None  # the driver connects itself
     address = parameters.get("host", "localhost"), parameters.get("port", 5432)
     try:
         connected = socket.create_connection(address, parameters.get("timeout"))
@@ -395,12 +395,12 @@ def check_state_folder(folder: Path) -> None:
 
 @contextlib.contextmanager
 def owned_folder(folder: Path) -> Iterator[None]:
-    """Own the state folder during the block; creates it if missing.
+    """Lock the state folder during the block; creates it if missing.
 
     The kernel releases the lock when the process ends for any reason; the file stays.
 
     Raises:
-        StateFolderError: another process owns it (with its PID); or it is not writable.
+        StateFolderError: another process owns it (the message has its PID), or it is not writable.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
@@ -421,7 +421,7 @@ def owned_name(database: Path, worker_id: str) -> Iterator[None]:
     Workers with separate state folders and names may share one database.
 
     Raises:
-        StateFolderError: another process has the name (with its PID).
+        StateFolderError: another process uses the name (the message has its PID).
     """
     path = database.with_name(f"{database.name}.{worker_id}.lock")
     try:
@@ -506,7 +506,7 @@ class NameOnServer:
         self._connection: sa.Connection | None = None
 
     def hold(self) -> None:
-        """Take the name, or check that it is still ours.
+        """Take the name, or check that this process still has it.
 
         Raises:
             StoreError: another worker has it.
@@ -571,7 +571,7 @@ class Prepared:
     """A statement for :class:`PreparedStatements`.
 
     Attributes:
-        text: with ``:name`` for values; returns a row for each changed one.
+        text: SQL with ``:name`` for values; returns one row per changed row.
         values: values by name.
     """
 
@@ -598,7 +598,7 @@ class PreparedStatements:
         """Execute and commit the statement; returns the number of changed rows.
 
         Raises:
-            sqlalchemy.exc.SQLAlchemyError: from the server, or it is unreachable.
+            sqlalchemy.exc.SQLAlchemyError: the server reports an error or is unreachable.
         """
         if self._is_broken():
             self.close()
@@ -628,12 +628,12 @@ class PreparedStatements:
         return known
 
     def _is_broken(self) -> bool:
-        """Whether the server has sent unexpected data, most likely that it closes the
+        """Whether the server has sent unexpected data, most likely a notice that it closes the
         connection."""
         return self._socket is not None and bool(select.select([self._socket], [], [], 0)[0])
 
     def _sort(self, error: Exception, text: str) -> None:
-        """Raise errors of the driver as SQLAlchemy does; closes a connection that may be broken."""
+        """Raise errors of the driver like SQLAlchemy; closes a connection that may be broken."""
         from pg8000.exceptions import DatabaseError, InterfaceError
 
         state = str(error.args[0].get("C", "")) if _is_of_server(error) else ""

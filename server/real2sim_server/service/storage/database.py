@@ -1,6 +1,6 @@
 """The database of a store: statements on a dedicated thread, durability, and failures.
 
-It only knows the table of its probe; ``store`` defines all others and their queries.
+It uses only the table of its probe; ``store`` defines all other tables and their queries.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ T = TypeVar("T")
 
 TIMEOUT_S = 5.0
 PATIENCE = 3.0
-"""Timeouts that a caller waits, for its turn and its answer."""
+"""Maximum wait of a caller, for its turn and its answer, in timeouts."""
 PROBE_S = 1.0
 """Interval of probes of a failing store [s]."""
 CHECK_S = 5.0
@@ -53,9 +53,9 @@ SCHEMA_TIMEOUT_S = 3600.0
 """Timeout of a migration, which may rewrite all tables [s]."""
 
 Durability = Literal["all", "edits", "process"]
-"""What is on disk before it is acknowledged: everything, everything except session steps, or
-nothing. Other writes survive a crash of the process, but the last ones not a crash of the
-machine."""
+"""Writes that are on disk before they are acknowledged: all, all except session steps, or none.
+Other writes survive a crash of the process; after a crash of the machine, the last ones may be
+lost."""
 
 OnCall = Callable[[str, float, bool], None]
 """Called after a call: ``read`` or ``write``, its seconds, and whether it succeeded."""
@@ -65,12 +65,12 @@ log = structlog.get_logger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class Write:
-    """A statement that writes, with its rows separate, so that it is compiled only once.
+    """A writing statement with separate rows; it is compiled only once.
 
     Attributes:
-        statement: text is passed to the driver unchanged, with tuples as rows.
+        statement: the statement; text is passed to the driver unchanged, with tuples as rows.
         rows: parameter rows; the statement is executed once for each.
-        prepared: the same as a prepared statement, for use if it is alone in its transaction.
+        prepared: the same as a prepared statement, used if it is alone in its transaction.
         fenced: number of rows that it must change. If it changes fewer, their sessions were taken
             over, and the transaction is rolled back. None for any number.
     """
@@ -94,21 +94,21 @@ class Write:
 
 
 class Database:
-    """SQLAlchemy Core on a dedicated thread, so that the event loop never waits for a disk.
+    """SQLAlchemy Core on a dedicated thread: the event loop never waits for a disk.
 
-    A failing database is detected within ``timeout_s``. From then on calls are refused immediately,
+    A failing database is detected within ``timeout_s``. From then on, calls are refused immediately
     until a probe of :meth:`watch` succeeds.
 
-    One thread is sufficient: an append takes 0.1 to 0.2 ms in SQLite's write-ahead mode, which only
-    supports one writer at a time, and appends keep the order of the calls. Code on other computing
-    threads may write directly with :meth:`execute`: a switch to another thread and back takes
+    One thread is sufficient: an append takes 0.1 to 0.2 ms in SQLite's write-ahead mode, which
+    supports only one writer at a time, and one thread keeps the order of the calls. Code on other
+    computing threads may write directly with :meth:`execute`, because switching threads takes
     longer than an append.
 
     Args:
         url: SQLAlchemy URL; ``sqlite:///path`` or, with its driver installed, ``postgresql://``.
         worker_id: name to hold while the database is open; None for a guest.
         timeout_s: timeout of a statement, a lock, an answer [s].
-        durability: what is on disk before it is acknowledged.
+        durability: writes that are on disk before they are acknowledged.
         migration: whether to migrate a store of an older schema.
         on_call: called after each read and write, on its thread.
     """
@@ -162,12 +162,12 @@ class Database:
 
     @property
     def is_server(self) -> bool:
-        """Whether it is a server, with its own clock and many writers."""
+        """Whether the database is a server, with its own clock and several writers."""
         return self._connected().dialect.name == "postgresql"
 
     @property
     def is_file(self) -> bool:
-        """Whether it is an SQLite file."""
+        """Whether the database is an SQLite file."""
         return self._file is not None
 
     async def watch(self) -> None:
@@ -179,7 +179,7 @@ class Database:
             except StoreError:
                 continue
             except Exception:
-                # Any error: without this loop the store would never recover.
+                # Catch any error: without this loop, the store would never recover.
                 log.exception("looking after the store failed")
 
     # --- statements -------------------------------------------------------------------------
@@ -230,13 +230,13 @@ class Database:
         """Like :meth:`write`, on the calling thread; never on the event loop.
 
         Args:
-            changes: executed in one transaction.
-            promised: whether they matter beyond a session: then they are on disk
-                before this returns, unless ``durability`` is ``process``.
+            changes: statements, executed in one transaction.
+            promised: whether they matter beyond a session. They are then on disk before this
+                returns, unless ``durability`` is ``process``.
         """
         self._refuse_while_down()
         durable = self._durability == "all" or (promised and self._durability == "edits")
-        # SQLite makes clients of a locked file sleep and retry; queueing here is faster.
+        # On a locked file, SQLite sleeps and retries; queueing here is faster.
         if not self._write_lock.acquire(timeout=self._timeout_s):
             raise self._noted(StoreUnavailableError("the write before this one has not ended"))
         try:
@@ -251,10 +251,10 @@ class Database:
         return counts
 
     async def on_thread(self, fn: Callable[[], T]) -> T:
-        """``fn()`` on the thread of the database, with the usual timeout.
+        """Run ``fn()`` on the database's thread, with the usual timeout.
 
         Raises:
-            StoreUnavailableError: it did not finish in time.
+            StoreUnavailableError: ``fn`` did not finish in time.
         """
         return await self._run(fn, patience_s=PATIENCE * self._timeout_s)
 
@@ -267,7 +267,7 @@ class Database:
         return await self.on_thread(self._pages_bytes)
 
     async def give_back(self, pages: int) -> bool:
-        """Return free pages of a database file to the disk; returns whether there are more."""
+        """Return free pages of a database file to the disk; returns whether more remain."""
         if self._file is None:
             return False
         return await self.on_thread(partial(self._shrink, pages))
@@ -285,8 +285,8 @@ class Database:
             with self._write_lock, self._connected().connect() as connection:
                 cursor = _driver_of(connection).cursor()
                 (before,) = cursor.execute("PRAGMA freelist_count").fetchone()
-                # One step per page; except in scripts, the driver executes only one for statements
-                # without columns.
+                # One step per page. Outside scripts, the driver executes only one step for
+                # statements without columns.
                 cursor.executescript(f"PRAGMA incremental_vacuum({pages})")
                 (after,) = cursor.execute("PRAGMA freelist_count").fetchone()
                 more = 0 < after < before
@@ -303,7 +303,7 @@ class Database:
         """Run ``fn()`` on the database's thread; it completes even if the caller is cancelled.
 
         Raises:
-            StoreUnavailableError: it did not finish within ``patience_s``.
+            StoreUnavailableError: ``fn`` did not finish within ``patience_s``.
         """
         work = asyncio.get_running_loop().run_in_executor(self._executor, fn)
         work.add_done_callback(_looked_at)
@@ -332,12 +332,12 @@ class Database:
             return [c.checked(c.made_by(connection).rowcount) for c in changes]
 
     def _executed_by_driver(self, change: Write, *, durable: bool) -> int:
-        """The same for one statement as text, on a file: SQLAlchemy's overhead would exceed
-        SQLite's time for appending a step."""
+        """The same for one text statement on a file. Bypasses SQLAlchemy, whose overhead exceeds
+        SQLite's time for an append."""
         statement, rows = cast("str", change.statement), change.rows or [()]
         with self._kept_writer(durable=durable) as writer:
             connection = _driver_of(writer)
-            # The driver begins a transaction automatically; it is rolled back if a row fails.
+            # The driver begins a transaction automatically, and rolls it back if a row fails.
             with connection:
                 if len(rows) == 1:
                     cursor = connection.execute(statement, cast("Any", rows[0]))
@@ -360,7 +360,7 @@ class Database:
         """The connection that writes to a file, reused unless it fails; the caller holds the write
         lock."""
         if self._writer is None:
-            # Taking a connection from the pool and returning it takes as long as an append.
+            # Borrowing a connection from the pool would take as long as an append.
             self._writer, self._writer_is_durable = self._connected().connect(), False
         if durable != self._writer_is_durable:
             self._set_durable(self._writer, durable=durable)
@@ -374,8 +374,8 @@ class Database:
             raise
 
     def _found_full(self, error: Exception) -> bool:
-        """Whether the disk was full. The write is then rolled back and the connection is kept. If
-        the last connection closed, readers might not be able to create their files."""
+        """Whether the disk was full. The write is then rolled back and the connection stays open:
+        if the last connection closed, readers might be unable to create their files."""
         return isinstance(sorted_error(error, folder=self._folder), StoreFullError)
 
     @property
@@ -383,7 +383,7 @@ class Database:
         return self._file.parent if self._file else None
 
     def _set_durable(self, writer: sa.Connection, *, durable: bool) -> None:
-        # NORMAL only loses committed transactions if the machine crashes.
+        # NORMAL loses committed transactions only if the machine crashes.
         pragma = f"PRAGMA synchronous={'FULL' if durable else 'NORMAL'}"
         _driver_of(writer).execute(pragma).close()
         self._writer_is_durable = durable
@@ -437,8 +437,8 @@ class Database:
         try:
             if self._name_on_server is not None:
                 self._name_on_server.hold()
-            # On a full disk existing connections still work, but new ones might not get their
-            # journal.
+            # On a full disk, existing connections still work, but new ones may be unable to create
+            # their journal.
             full = isinstance(self._trouble, StoreFullError)
             if self._trouble is not None and self._file is not None and not full:
                 self._reconnect()
@@ -484,7 +484,7 @@ class Database:
         """Create or migrate the schema, with a long timeout."""
         engine = self._connected()
         with engine.connect():
-            pass  # The connection is checked with the usual timeout.
+            pass  # Checks the connection, with the usual timeout.
         if self._file is None and engine.dialect.name == "sqlite":
             prepare_schema(engine, policy=self._migration)
             return
@@ -522,6 +522,6 @@ def _driver_of(connection: sa.Connection) -> sqlite3.Connection:
 
 
 def _looked_at(work: asyncio.Future[Any]) -> None:
-    """Retrieve the outcome of abandoned work, so that asyncio does not log it as unhandled."""
+    """Retrieve the outcome of abandoned work; otherwise asyncio would log it as unhandled."""
     if not work.cancelled():
         work.exception()

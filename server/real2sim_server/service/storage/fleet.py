@@ -48,7 +48,7 @@ class Leases:
     """The lease of a worker, and takeovers of expired ones.
 
     Args:
-        store: open during use.
+        store: an open store.
         worker_id: id of this worker.
         seconds: duration of a lease.
 
@@ -70,12 +70,12 @@ class Leases:
         await self._promise(self._seconds, document)
 
     async def give_up(self, document: Mapping[str, Any]) -> None:
-        """End the lease: other workers may take over the sessions immediately."""
+        """End the lease; other workers may take over the sessions immediately."""
         await self._promise(0.0, document)
 
     async def take_over(self, session_id: str) -> SessionRow | None:
-        """Claim an open session of this worker or of one with an expired lease; None if there is
-        none, or another worker has it."""
+        """Claim an open session of this worker, or of a worker with an expired lease; None if the
+        session is not open or another worker has it."""
         s = t.sessions.c
         is_free = (s.worker_id == self.worker_id) | ~is_alive(s.worker_id, self._store)
         claimed = sa.update(t.sessions).where((s.session_id == session_id) & s.closed_us.is_(None))
@@ -110,7 +110,7 @@ class Leases:
         first = Write(sa.insert(t.workers).values(worker_id=self.worker_id, **values))
 
         def promise() -> None:
-            # A lease is useless after a crash of the machine, so it need not be durable.
+            # Leases need not be durable: they are useless after a crash of the machine.
             (count,) = self._store.database.execute([renewed], promised=False)
             if not count:
                 self._store.database.execute([first], promised=False)
@@ -146,7 +146,7 @@ BEAT_S = 1.0
 RETRY_S = 1.0
 """Interval of connection attempts [s]."""
 PAUSE_S = 0.05
-"""Delay from a notification to the resulting query, to collect further ones [s]."""
+"""Delay from a notification to the resulting query, to collect more notifications [s]."""
 
 log = structlog.get_logger(__name__)
 
@@ -227,7 +227,7 @@ class Notices:
             try:
                 self._listen_once(loop)
             except Exception as error:
-                # The store logs its own failures; meanwhile waiters poll.
+                # The store logs its own failures; until it recovers, waiters poll.
                 log.debug("not listening", reason=str(error))
             self._stop.wait(RETRY_S)
 

@@ -29,7 +29,7 @@ class ClaimedJob:
     Attributes:
         info: the last stored record.
         epoch: fencing number; writes with an older one are refused.
-        deaths: workers that died while they ran it.
+        deaths: number of workers that died while running it.
         portable: whether it can be rebuilt from ``info``.
         cancelled: whether a client has cancelled it.
     """
@@ -71,7 +71,7 @@ class JobLog:
         await self._store.write(Write(sa.insert(t.jobs), [row]), *self._notice(), reply=reply)
 
     async def update(self, job: JobInfo, *, epoch: int) -> None:
-        """Store the job's state. Raises FencedError: another worker has it, or it was deleted."""
+        """Store the job's state. Raises FencedError if it was taken over or deleted."""
         mine = (t.jobs.c.job_id == job.job_id) & (t.jobs.c.epoch == epoch)
         change = sa.update(t.jobs).where(mine).values(_row(job))
         await self._store.write(Write(change, fenced=1), *self._notice())
@@ -89,7 +89,7 @@ class JobLog:
         await self._store.write(Write(change), *self._notice())
 
     async def cancelled_or_lost(self, epochs: Mapping[str, int]) -> tuple[set[str], set[str]]:
-        """The ids of jobs that clients have cancelled, and of those this worker has lost.
+        """The ids of jobs that clients have cancelled, and of jobs that this worker has lost.
 
         Args:
             epochs: fencing numbers by job id.
@@ -102,8 +102,8 @@ class JobLog:
         return {name for name, row in kept.items() if row["cancelled"]}, set(epochs) - set(kept)
 
     async def orphaned(self, *, own: bool) -> list[str]:
-        """Ids of unfinished jobs, oldest first: of dead workers, or of this worker's earlier runs
-        if ``own``."""
+        """Ids of unfinished jobs of dead workers, or of this worker's earlier runs if ``own``;
+        oldest first."""
         return await self._ids(self._is_orphaned(own=own))
 
     async def claim(self, job_id: str, *, own: bool = False) -> ClaimedJob | None:
@@ -120,7 +120,8 @@ class JobLog:
         return await self._claim(self._is_first_of(self._is_overdue() & t.jobs.c.kind.in_(kinds)))
 
     def _is_first_of(self, free: sa.ColumnElement[bool]) -> sa.ColumnElement[bool]:
-        """Concurrent workers get different jobs: a database server skips rows locked by others."""
+        """SQL condition: the first matching job. Concurrent workers get different jobs, because a
+        database server skips rows that others have locked."""
         j = t.jobs.c
         first = sa.select(j.job_id).where(free).order_by(j.created_us, j.job_id).limit(1)
         first = first.with_for_update(skip_locked=True).correlate(None)

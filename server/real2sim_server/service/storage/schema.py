@@ -73,8 +73,8 @@ scenario_log = Table(
     Column("created_us", BigInteger, nullable=False),
 )
 
-# State of a scenario at one revision, so that opening need not replay the whole log. Derived from
-# the log: losing a row costs time, but no edits.
+# State of a scenario at one revision, to open it without replaying the whole log. Snapshots are
+# derived from the log: losing one costs time, but no edits.
 scenario_snapshots = Table(
     "scenario_snapshots",
     metadata,
@@ -146,9 +146,9 @@ jobs = Table(
     Column("created_us", BigInteger, nullable=False),
     # Increases whenever a worker takes over the job, as for a session.
     Column("epoch", Integer, nullable=False, server_default="0"),
-    # Number of workers that died while running it.
+    # Number of workers that died while running the job.
     Column("deaths", Integer, nullable=False, server_default="0"),
-    # Whether any worker can rebuild it from its document, and whether a client has cancelled it.
+    # Whether any worker can rebuild the job from its document; whether a client has cancelled it.
     Column("portable", Integer, nullable=False, server_default="0"),
     Column("cancelled", Integer, nullable=False, server_default="0"),
 )
@@ -221,7 +221,7 @@ class SnapshotRow:
 
     Attributes:
         revision: the revision.
-        made_by: program version that created it; another may interpret the log differently.
+        made_by: program version that created it; other versions may interpret the log differently.
         state: encoded by :func:`real2sim_server.edit.pack_state`.
     """
 
@@ -250,7 +250,7 @@ class SessionRow:
     Attributes:
         worker_id: worker that currently has it.
         scenario_id, scenario_revision: its start; None for the bare scene.
-        token_hash: hash of its token, from :func:`~..tokens.token_hash`.
+        token_hash: hash of its token, from :func:`~..accounts.token_hash`.
         closed_us, reason: None while it is open.
         owner: name of the token that created it.
         epoch: number of takeovers.
@@ -296,11 +296,10 @@ class SessionEntry:
 
 @dataclass(frozen=True)
 class StoredReply:
-    """An answer stored for a request that may be repeated with the same Idempotency-Key.
+    """A stored reply, for requests that are repeated with the same Idempotency-Key.
 
     Attributes:
-        fingerprint: SHA-256 of the request; a different one with the same key is refused.
-        fingerprint: SHA-256 of the request; another one under the same key is refused.
+        fingerprint: SHA-256 of the request; another request with the same key is refused.
     """
 
     key: str
@@ -355,7 +354,7 @@ def prepare_schema(engine: sa.Engine, *, policy: Policy = "auto") -> None:
     """Create the schema, or migrate an older one. Several processes may call this at once.
 
     Args:
-        engine: of the store.
+        engine: database engine of the store.
         policy: whether an older schema is migrated or refused.
 
     Raises:
@@ -441,7 +440,7 @@ def _alone(engine: sa.Engine) -> Iterator[Connection]:
     """A transaction during which no other process prepares the schema."""
     with engine.connect() as connection:
         if engine.dialect.name == "sqlite":
-            # The driver starts no transaction before it defines tables.
+            # The driver does not begin a transaction for table definitions.
             connection.exec_driver_sql("BEGIN IMMEDIATE")
         elif engine.dialect.name == "postgresql":
             connection.exec_driver_sql(f"SELECT pg_advisory_xact_lock({SCHEMA_LOCK})")
@@ -450,7 +449,7 @@ def _alone(engine: sa.Engine) -> Iterator[Connection]:
 
 
 def _version(connection: Connection) -> int | None:
-    """The schema version; None for an empty database, 0 for one made before the first release."""
+    """The schema version: None for an empty database, 0 for one from before the first release."""
     tables = sa.inspect(connection)
     if not tables.has_table(alembic_version.name) or tables.has_table("schema_version"):
         return 0 if tables.has_table(sessions.name) else None
@@ -459,7 +458,7 @@ def _version(connection: Connection) -> int | None:
 
 
 def _rewrite(engine: sa.Engine) -> None:
-    """Rewrite an SQLite file, so that it keeps neither old values nor free pages."""
+    """Rewrite an SQLite file, to remove old values and free pages."""
     if engine.dialect.name != "sqlite":
         return
     with engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:

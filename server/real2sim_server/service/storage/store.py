@@ -20,8 +20,8 @@ from .schema import Claim, Policy, ScenarioRow, SessionEntry, SessionRow, Snapsh
 # --- Session logs --------------------------------------------------------------------------------
 
 # A worker that was suspended for longer than its lease may resume in the middle of a step, after
-# another one has taken over the session. Each write therefore has the epoch of its claim, and the
-# statement compares it with the session's in the database.
+# another worker has taken over the session. Each write therefore carries the epoch of its claim,
+# and the statement compares it with the session's epoch in the database.
 
 ClaimedEntries = tuple[Claim, Sequence[SessionEntry]]
 """Entries for a session's log, and the claim on the session."""
@@ -59,7 +59,7 @@ def withdrawn(claim: Claim, from_seq: int) -> list[Write]:
     s, log = t.sessions.c, t.session_log.c
     mine = (s.session_id == claim.session_id) & (s.epoch == claim.epoch)
     end = (log.session_id == claim.session_id) & (log.seq >= from_seq)
-    # Changes nothing, but locks the row, so that the session cannot be taken over meanwhile.
+    # Changes nothing, but locks the row against a takeover of the session.
     held = sa.update(t.sessions).where(mine).values(epoch=claim.epoch)
     return [Write(held, fenced=1), Write(sa.delete(t.session_log).where(end))]
 
@@ -68,9 +68,9 @@ def withdrawn(claim: Claim, from_seq: int) -> list[Write]:
 def _append(rows: int) -> str:
     """The statement that appends entries, for SQLite.
 
-    Every step of a session executes it, and assembling it in SQLAlchemy takes as long as the
-    append. With many rows in one statement the driver releases the GIL only once; releasing it per
-    row lets other threads hold it for longer than a row takes.
+    Every step of a session executes it, and assembling it in SQLAlchemy would take as long as the
+    append. For many rows in one statement, the driver releases the GIL only once. If it released
+    the GIL per row, other threads would hold it for longer than a row takes.
     """
     values = ", ".join(["(?, ?, ?, ?, ?, ?, ?)"] * rows)
     given = ", ".join(f"v.column{k}" for k in range(1, 7))
@@ -83,7 +83,7 @@ def _append(rows: int) -> str:
 def _appended_on_server(values: Sequence[tuple[object, ...]]) -> Write:
     given = {f"v{k}": value for k, value in enumerate(chain.from_iterable(values))}
     text = _append_on_server(len(values))
-    # Either all rows of a session are written or none: the statement needs no transaction.
+    # The statement writes all rows of a session or none, so it needs no transaction.
     alone = len({row[0] for row in values}) == 1
     prepared = Prepared(f"{text.text} RETURNING 1", given) if alone else None
     return Write(text.bindparams(**given), fenced=len(values), prepared=prepared)
@@ -137,7 +137,7 @@ class Store:
         url: SQLAlchemy URL; ``sqlite:///path`` or, with its driver installed, ``postgresql://``.
         worker_id: name to hold while the store is open; None for a guest.
         timeout_s: timeout of a statement, a lock, an answer [s].
-        durability: what is on disk before it is acknowledged.
+        durability: writes that are on disk before they are acknowledged.
         migration: whether to migrate a store of an older schema.
         on_call: called after each read and write, on its thread.
     """
@@ -167,7 +167,7 @@ class Store:
 
         Raises:
             StoreError: the database cannot be opened, or has a newer version.
-            StateFolderError: another worker of that name uses it.
+            StateFolderError: another worker with that name uses the store.
         """
         await self.database.open(Write(_delete_old_replies()))
 
@@ -202,7 +202,7 @@ class Store:
         )
 
     async def scenario(self, scenario_id: str) -> ScenarioRow | None:
-        """The scenario of that id."""
+        """The scenario with that id."""
         query = sa.select(t.scenarios).where(t.scenarios.c.scenario_id == scenario_id)
         rows = await self.database.read(query)
         return ScenarioRow(**rows[0]) if rows else None
@@ -231,8 +231,9 @@ class Store:
         created_us: int,
         reply: StoredReply | None = None,
     ) -> None:
-        """Append one revision and, in the same transaction, the reply to its request; on the
-        calling thread, never on the event loop.
+        """Append one revision and, in the same transaction, the reply to its request.
+
+        Runs on the calling thread; do not call it on the event loop.
 
         Args:
             scenario_id: the scenario.
@@ -255,7 +256,7 @@ class Store:
         return (await self.database.write(Write(changes)))[-1] > 0
 
     async def newest_of_scenario(self, scenario_id: str) -> tuple[int, str] | None:
-        """Number of revisions of a scenario, and its name; None if there is no such scenario."""
+        """Number of revisions of a scenario, and its name; None if the scenario does not exist."""
         log, row = t.scenario_log, t.scenarios
         newest = sa.select(sa.func.max(log.c.revision)).where(log.c.scenario_id == scenario_id)
         query = sa.select(newest.scalar_subquery().label("newest"), row.c.name)
@@ -299,7 +300,7 @@ class Store:
         return kinds
 
     async def scenarios_naming(self, asset_id: str) -> list[str]:
-        """Scenarios that have an operation with this asset in their log, also if undone."""
+        """Scenarios whose log has an operation with this asset, including undone ones."""
         log = t.scenario_log
         named = log.c.entry.contains(f'"asset_id": {json.dumps(asset_id)}', autoescape=True)
         query = sa.select(log.c.scenario_id).where(named).distinct()
@@ -326,7 +327,7 @@ class Store:
         )
 
     async def session(self, session_id: str) -> SessionRow | None:
-        """The session of that id, open or closed."""
+        """The session with that id, open or closed."""
         query = sa.select(t.sessions).where(t.sessions.c.session_id == session_id)
         rows = await self.database.read(query)
         return SessionRow(**rows[0]) if rows else None
@@ -341,8 +342,7 @@ class Store:
         return [SessionRow(**row) for row in rows]
 
     async def close_session(self, claim: Claim, *, reason: str) -> None:
-        """Mark a session as ended; idempotent, and without effect if another worker has the
-        session."""
+        """Mark a session as ended; idempotent. No effect if another worker has the session."""
         s = t.sessions.c
         still_open = (s.session_id == claim.session_id) & s.closed_us.is_(None)
         mine = still_open & (s.epoch == claim.epoch)
@@ -403,8 +403,8 @@ class Store:
         return appended(logs, on_server=self.database.is_server)
 
     async def withdraw(self, claim: Claim, *, from_seq: int, replies: Sequence[str] = ()) -> None:
-        """Remove the end of a session's log and replies by their keys, which were stored ahead but
-        never took effect.
+        """Remove the end of a session's log, and replies by their keys; both were stored ahead of
+        time and never took effect.
 
         Raises:
             FencedError: another worker has the session.
@@ -451,7 +451,7 @@ class Store:
         return int(row["bytes"]) + ROW_BYTES * int(row["rows"])
 
     async def give_back(self, pages: int) -> bool:
-        """Return free pages of a database file to the disk; returns whether there are more."""
+        """Return free pages of a database file to the disk; returns whether more remain."""
         return await self.database.give_back(pages)
 
     # --- other tables -------------------------------------------------------------------
@@ -497,7 +497,7 @@ def _insert_rows(table: sa.Table, *rows: Mapping[str, Any]) -> Write:
 
 @cache
 def _insert(table: sa.Table) -> sa.Insert:
-    """One statement for all rows of a table, because caching new statements is slower."""
+    """One statement for all rows of a table; caching new statements would be slower."""
     return sa.insert(table)
 
 

@@ -85,7 +85,7 @@ class CrashPulse:
 
 
 def column_car(*, speed: float = 0.0) -> DeformableBody:
-    """A central column of the barrier test's car, along x, at ``speed`` [m/s]."""
+    """The central column of the barrier test's car, along x, at ``speed`` [m/s]."""
     preset = preset_of("vehicle")
     fraction = float(np.prod(COLUMN) / np.prod(MALIBU_SIZE[1:]))
     block = box_particles((MALIBU_SIZE[0], *COLUMN), spacing=preset.spacing, density=1.0)
@@ -153,7 +153,7 @@ def barrier_test(speed: float, backend: str, *, duration: float | None = None) -
 
 
 def rear_end(speed: float, backend: str) -> tuple[CrashPulse, CrashPulse]:
-    """A car of 1000 kg into the rear of a stationary one of 2000 kg: the pulses of both."""
+    """A car of 1000 kg hits the rear of a stationary one of 2000 kg; returns both pulses."""
     x = (CAR_SIZE[0] + GAP) / 2
     striker = whole_car("striker", mass=1000.0, place=(-x, 0, 0), velocity=(speed, 0, 0))
     struck = whole_car("struck", mass=2000.0, place=(x, 0, 0))
@@ -165,7 +165,7 @@ def rear_end(speed: float, backend: str) -> tuple[CrashPulse, CrashPulse]:
 
 
 def side_crash(speed: float, backend: str) -> tuple[CrashPulse, CrashPulse]:
-    """A car squarely into the side of a stationary one: the pulses of both."""
+    """A car hits the side of a stationary one squarely; returns both pulses."""
     striker = whole_car("striker", place=(-(CAR_SIZE[0] + GAP) / 2, 0, 0), velocity=(speed, 0, 0))
     struck = whole_car("struck", place=((CAR_SIZE[1] + GAP) / 2, 0, 0), yaw=np.pi / 2)
     result = _crash([striker, struck], [], 0.4, backend)
@@ -331,7 +331,7 @@ def restitution_by_speed(backend: str) -> list[Check]:
 
 
 def collinear_pair(backend: str) -> list[Check]:
-    """1000 kg into the rear of 2000 kg at 10 m/s: duration, delta-v, and crush of both.
+    """1000 kg hit the rear of 2000 kg at 10 m/s: duration, delta-v, and crush of both.
 
     The expected delta-v follows from the published restitution and its spread, not from the
     simulated one.
@@ -353,7 +353,7 @@ def collinear_pair(backend: str) -> list[Check]:
 
 
 def pole(backend: str) -> list[Check]:
-    """Sideways into a pole at 32 km/h."""
+    """A car slides sideways into a pole at 32 km/h."""
     test = side_pole(8.9, backend)
     return [
         _within("side pole: intrusion", test.residual_crush, 0.4, 0.25, "m"),
@@ -362,7 +362,7 @@ def pole(backend: str) -> list[Check]:
 
 
 def t_bone(backend: str) -> list[Check]:
-    """A car into the side of another at 12 m/s: both are dented and reach a common speed."""
+    """A car hits the side of another at 12 m/s: both are dented and reach a common speed."""
     striker, struck = side_crash(12.0, backend)
     return [
         Check("side: door pushed in", struck.residual_crush, 0.2, 0.1, "m"),
@@ -372,7 +372,7 @@ def t_bone(backend: str) -> list[Check]:
 
 
 def roof(backend: str) -> list[Check]:
-    """Dropped on its roof: intrusion by the force of three times the weight at 127 mm."""
+    """A car drops on its roof: intrusion, for a force of three times the weight at 127 mm."""
     test = roof_drop(ROOF_SPEED, backend)
     return [
         _within("roof: intrusion", test.dynamic_crush, ROOF_DEPTH, 0.25, "m"),
@@ -398,7 +398,7 @@ POST = 0.1
 
 
 def tyre_braking(backend: str) -> list[Check]:
-    """A car with locked wheels slides v^2 / (2 mu g) in v / (mu g), and pitches on its springs."""
+    """A car with locked wheels slides v^2 / (2 mu g) in v / (mu g) and pitches on its springs."""
     speed = 10.0
     road = Plane(name="ground", friction=GRIP)
     centre = whole_car().rest.centre_of_mass
@@ -455,7 +455,7 @@ def handover(backend: str) -> list[Check]:
 
 
 def thin_post(backend: str) -> list[Check]:
-    """A post of a third of a cell stops a car at 11 m/s, at its middle and off centre."""
+    """A post a third of a cell wide stops a car at 11 m/s, centred and off centre."""
     speed, checks = 11.0, []
     for aside in (0.0, 0.3):
         post = Box(

@@ -18,7 +18,7 @@ from ..rollout import SimulateOptions
 from ..spawn import object_particles, spaced_for
 from ..structure import VEHICLES, ObjectPhysics, preset_of
 
-# Views from the recording vehicle: sides that no camera saw cannot be shown.
+# Views from the recording vehicle. Sides that no camera has recorded cannot be shown.
 
 VIEWS_MAX = 24
 """Maximum number of recorded frames to evaluate."""
@@ -227,14 +227,14 @@ TURNED_OVER = np.radians(158.0)
 """Roll angle of a vehicle that falls on the edge of its roof: 22 degrees from upside down (SAE J996
 has 25 degrees of roll)."""
 FALL = 0.4
-"""Height of the lowest corner above the road at the start of a roof crash [m]; it is falling by
-then."""
+"""Height of the lowest corner above the road at the start of a roof crash [m]; the vehicle is
+already falling."""
 FRAME_RATE, SLOW = 60.0, 4.0
 """Frame rate [Hz], and slow-motion factor of films."""
 
 
 def frontal(request: Request) -> Experiment:
-    """One vehicle head-on into a concrete block, at 15 m/s."""
+    """One vehicle hits a concrete block head-on at 15 m/s."""
     subject = _best(request)
     speed = 15.0 if request.speed is None else request.speed
     pose, forward = _on_the_road(request, subject)
@@ -250,7 +250,7 @@ def frontal(request: Request) -> Experiment:
 
 
 def pole(request: Request) -> Experiment:
-    """One vehicle frontally into a post, at 12 m/s."""
+    """One vehicle hits a post frontally at 12 m/s."""
     subject = _best(request)
     speed = 12.0 if request.speed is None else request.speed
     pose, forward = _on_the_road(request, subject)
@@ -266,7 +266,7 @@ def pole(request: Request) -> Experiment:
 
 
 def t_bone(request: Request) -> Experiment:
-    """One vehicle into the middle of the side of a stationary vehicle, at 15 m/s."""
+    """One vehicle hits the middle of a stationary vehicle's side at 15 m/s."""
     speed = 15.0 if request.speed is None else request.speed
     runner = _best(request)
     others = [s for s in _candidates(request) if s is not runner]
@@ -295,7 +295,7 @@ def t_bone(request: Request) -> Experiment:
 
 
 def roof(request: Request) -> Experiment:
-    """One vehicle upside down on the edge of its roof, as after a fall of 1.5 m."""
+    """One vehicle lands upside down on the edge of its roof, as after a fall of 1.5 m."""
     speed = 5.4 if request.speed is None else request.speed
     subject = _best(request)
     own, forward = _on_the_road(request, subject)
@@ -328,7 +328,7 @@ def _best(request: Request) -> PlacedObject:
 
 
 def _candidates(request: Request) -> list[PlacedObject]:
-    """The named vehicles, else all cars at the start; experiments move them anyway."""
+    """The named vehicles, else all cars at the start; experiments replace their poses."""
     if request.named:
         return list(request.chosen)
     there = [
@@ -430,7 +430,7 @@ def _made(
 WALL_GAP = 0.5
 """Initial gap between vehicle and wall [m]: contact after 1 s at 0.5 m/s."""
 DROP_HEIGHT = 1.225
-"""Free fall of 0.5 s [m]."""
+"""Drop height: free fall of 0.5 s [m]."""
 DAMPED = FixedCorotated(young=2e6, poisson=0.4, density=200.0, viscosity=1.5e4)
 """The paper's material for the fall, with damping. The undamped material of the paper rebounds by a
 third of the height for a block of this size; this viscosity leaves a slight bounce."""
@@ -456,8 +456,8 @@ def set_up(
     """Set up an experiment on a scene.
 
     Args:
-        name: ``wall``: one vehicle against a virtual wall; ``pair``: vehicles into as many
-            stationary ones, without gravity; ``drop``: vehicles dropped on the extracted ground;
+        name: ``wall``: one vehicle hits a virtual wall. ``pair``: vehicles hit an equal number of
+            stationary ones, without gravity. ``drop``: vehicles drop on the extracted ground.
             ``frontal``, ``t_bone``, ``pole``, ``roof``: the crash tests above.
         preset: material preset; by default ``paper`` for the paper's experiments and ``vehicle``
             for crashes.
@@ -535,7 +535,7 @@ def _wall(request: Request) -> Experiment:
 
 
 ROLLING_FRICTION = 0.0
-"""Vehicles of the paper's preset have no wheels; frictionless sliding stands in for rolling."""
+"""Vehicles of the paper's preset have no wheels; frictionless sliding replaces rolling."""
 
 
 def _standing_road(request: Request, subject: PlacedObject) -> Collider:
@@ -656,7 +656,7 @@ def _drop(request: Request) -> Experiment:
 
 
 def _reach(request: Request, subject: PlacedObject) -> tuple[Float, Float]:
-    """Extent of an object's particles back and forth along its own axes, [3] and [3] [m].
+    """Extent of an object's particles, backwards and forwards along its axes, [3] and [3] [m].
 
     Tracked boxes are less exact: particles extend up to a voxel beyond them.
     """

@@ -136,7 +136,7 @@ REFUSED = (
     ({"method": {"kind": "sobol", "count": 10_000}}, "20000 episodes"),
     ({"reset": {"seed": 3}}, "reset names 'seed'"),
     ({"parameters": {}}, "nothing would vary"),
-    ({"method": {"kind": "search"}}, "a search is of one"),
+    ({"method": {"kind": "search"}}, "a search tests exactly one"),
     ({"corner_case": None, "openscenario": "<a/>"}, "a"),
     ({"openscenario": "<a/>"}, "give one of"),
 )

@@ -85,7 +85,7 @@ def test_a_planner_that_does_not_say_what_it_needs_is_told_the_line(worker, tmp_
 def test_an_option_of_reset_that_is_given_twice_is_refused_by_name(worker):
     words = ("drive", "--scene", "tiny", "--steps", "1", "--seed", "3", "--reset")
 
-    assert "seed is given by --seed and in --reset" in printed(worker, *words, '{"seed": 4}')
+    assert "seed is set by both --seed and --reset" in printed(worker, *words, '{"seed": 4}')
 
 
 def test_a_token_with_the_end_of_its_line_is_sent_without_it(make_settings):

@@ -1,6 +1,6 @@
 """Alembic's environment: runs the revisions of this folder on a given connection.
 
-A worker and ``real2sim store migrate`` pass the connection that holds the lock of the schema, see
+A worker and ``real2sim store migrate`` pass the connection that holds the schema lock, see
 :mod:`..schema`. To write a revision, set ``REAL2SIM_STORE_URL`` and run ``alembic revision``.
 """
 
