@@ -272,7 +272,7 @@ class SweepRequest(Model):
             raise ValueError(f"{len(self.planners)} planners; a search tests exactly one")
         only = sorted({"seeds", "stop", "metrics", "worst", "rank_by"} & self.model_fields_set)
         if only:
-            raise ValueError(f"{only[0]!r} is an option of sweeps; a search chooses its own episodes")
+            raise ValueError(f"{only[0]!r} is for sweeps; a search chooses its own episodes")
 
     def most_episodes(self) -> int:
         """Maximum number of episodes."""
