@@ -184,9 +184,7 @@ def _reset_options(
             options[name] = value
     if spawn is not None:
         if "spawn" in agents:
-            raise typer.BadParameter(
-                "agents.spawn is set by both --spawn and --reset; set it once"
-            )
+            raise typer.BadParameter("agents.spawn is set by both --spawn and --reset; set it once")
         options["agents"] = {**agents, "spawn": json_object("--spawn", spawn)}
     return options
 
