@@ -1,8 +1,7 @@
 """Compiled loops over Gaussians in one camera image: projection, depth, visibility, samples.
 
 Loops run over a range of Gaussians and write only to that range, so ranges can be distributed over
-threads and the result does not depend on the number of threads. The kernels release the GIL;
-Numba's ``parallel`` would take several times longer to compile.
+threads and the result does not depend on the number of threads. The kernels release the GIL.
 """
 # ruff: noqa: PLR0917 - compiled loops take their arrays one by one
 
@@ -18,8 +17,8 @@ NEAR = np.float32(0.3)
 MAX_FOOTPRINT = 24
 """Half-width of the largest footprint in the depth image [px]."""
 GRAZING = 0.15
-"""Minimum cosine between ray and surface for colours of objects. At smaller angles, a few
-centimetres of error give the colour of the adjacent side, for example a lamp on a wing.
+"""Minimum cosine between ray and surface normal for colours of objects. At grazing angles, an error
+of a few centimetres samples the adjacent side, for example a lamp instead of a wing.
 """
 
 
@@ -220,7 +219,7 @@ def robust_mean(colours, weights, result, known):
                 if abs(np.float32(colours[i, s, c]) - median) <= 24:
                     value += weights[i, s] * np.float32(colours[i, s, c])
                     fraction += weights[i, s]
-            # fraction is never 0: the median itself is among the samples.
+            # fraction is never 0, because the median is one of the samples.
             result[i, c] = value / (fraction * np.float32(255.0))
 
 

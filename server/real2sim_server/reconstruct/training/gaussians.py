@@ -18,8 +18,8 @@ from . import kernels
 
 # Activations: raw parameters to scales, opacities and colours, owner by owner.
 #
-# Torch would pass over the parameters a dozen times on one thread in each direction. The CPU
-# kernels take one pass each way; :func:`activated_plain` is the reference in plain torch.
+# The CPU kernels take one pass each way, compared with a dozen single-threaded passes in torch.
+# :func:`activated_plain` is the reference in plain torch.
 
 
 class Activated(NamedTuple):
@@ -160,7 +160,7 @@ def _array(tensor: Tensor) -> NDArray[np.float32]:
 
 FIELDS = ("means", "log_scales", "quats", "logits", "sh", "fourier")
 OBJECT_FIELDS = ("fourier",)
-"""Fields that only the Gaussians of objects have."""
+"""Fields of object Gaussians only."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -339,6 +339,6 @@ def _fourier(scene: Scene, rows: int, harmonics: int) -> Tensor:
 
 
 def leaf(tensor: Tensor, device: torch.device | str | None = None) -> Tensor:
-    """A contiguous float32 copy that requires gradients, on ``device`` or where it was."""
+    """A contiguous float32 copy that requires gradients, on ``device`` or the current one."""
     placed = tensor.detach() if device is None else tensor.detach().to(device)
     return placed.float().clone().contiguous().requires_grad_()

@@ -232,8 +232,8 @@ def at_width(options: TrainOptions, width: int) -> TrainOptions:
     """``options`` for images of ``width`` [px], coarse to fine if they are wider than the preset's.
 
     Earlier stages keep their image widths, so most steps cost the same. In the last stage, one
-    image at full size alternates with two downscaled images; otherwise the scene would be too sharp
-    for smaller images.
+    image at full size alternates with two downscaled images, so that smaller images do not become
+    too sharp.
     """
     part = -(-width // options.max_width)
     if part > 1:
@@ -246,7 +246,7 @@ def preset(name: str, **changes: Any) -> TrainOptions:
     """The preset of that name with some values changed.
 
     Raises:
-        ReconstructError: an unknown name, with those there are.
+        ReconstructError: the name is unknown; the message lists the presets.
     """
     if name not in PRESETS:
         raise ReconstructError(f"preset must be one of {list(PRESETS)}, not {name!r}")
@@ -254,7 +254,7 @@ def preset(name: str, **changes: Any) -> TrainOptions:
 
 
 def exponential_decay(span: tuple[float, float], fraction: float) -> float:
-    """Interpolate between the values of ``span`` as ``fraction`` goes from 0 to 1."""
+    """Interpolate between the values of ``span`` for ``fraction`` from 0 to 1."""
     first, last = span
     return float(first * (last / first) ** min(max(fraction, 0.0), 1.0)) if first > 0 else 0.0
 
@@ -294,7 +294,7 @@ def from_values(kind: type, values: dict[str, Any]) -> Any:
     for item in fields(kind):
         default = getattr(kind(), item.name)
         if item.name not in values:
-            # Absent in runs of earlier releases.
+            # Missing in runs of earlier releases.
             continue
         value = values[item.name]
         if is_dataclass(default):
