@@ -3,8 +3,8 @@
 A person's cluster is stored in the rest pose of the body model. The trajectory determines the pose
 at each time: footsteps are placed along the path by the distance covered
 (:mod:`real2sim_server.body.gait`), so another path or speed gives other steps. Poses are tabulated
-on demand, one segment at a time, and interpolated. A person without a trajectory walks straight on
-with every step of a :class:`Stride`.
+on demand, one segment at a time, and interpolated. A person without a trajectory walks straight
+ahead, as given by a :class:`Stride`.
 
 Linear blend skinning moves the means. The blended quaternion of the joints, the rotation nearest to
 the blended transforms, rotates a Gaussian; its scales do not change.
@@ -72,7 +72,7 @@ def pose_gaussians(  # noqa: PLR0917
                 continue
             for c in range(12):
                 blend[c] += share * rows[j, c]
-            # Both signs of a quaternion are one rotation: those of the first joint's side add up.
+            # q and -q are the same rotation: align signs with the first joint before blending.
             same = 0.0
             for c in range(12, 16):
                 same += rows[j, c] * rows[first, c]
@@ -98,24 +98,24 @@ def pose_gaussians(  # noqa: PLR0917
 ROW_US = 20_000
 """Spacing of tabulated poses [us]; joints move linearly in between."""
 PIECE = 100
-"""Poses that are tabulated at once."""
+"""Number of poses tabulated at once."""
 KEPT_PIECES, KEPT_CLOUDS = 16, 4
 MAX_DURATION_US = 3_600_000_000
-"""People on longer trajectories do not move their limbs [us]."""
+"""Maximum duration of trajectories with moving limbs [us]."""
 PACE, FASTEST = 0.05, 8.0
-"""Spacing of the paces that striding is tabulated for, and the last of them [m/s]."""
+"""Spacing and maximum of the tabulated paces [m/s]."""
 STRIDE_ROWS = 48
 """Number of tabulated poses in a stride of two steps."""
 KEPT_PACES, KEPT_STYLES = 64, 16
 SETTLING = 0.3
-"""Somebody's pace follows the speed within this time [s]."""
+"""Time in which the pace follows the speed [s]."""
 
 
 class Stride(NamedTuple):
     """Walking state of a person without a trajectory.
 
     Attributes:
-        steps: number so far; each whole number is one swing of a foot.
+        steps: number of steps so far; each whole number is one swing of a foot.
         pace: speed that determines the step length [m/s].
     """
 
@@ -294,7 +294,7 @@ class Figure:
         return points
 
     def _walk(self, trajectory: Trajectory) -> _Walk:
-        """The walk along a trajectory, cached for its lifetime; needs the lock."""
+        """The walk along a trajectory, cached for its lifetime. The caller must hold the lock."""
         walk = self._walks.get(trajectory)
         if walk is None:
             walk = self._walks[trajectory] = _Walk(self, trajectory)
@@ -323,7 +323,7 @@ class Figure:
         return _between((turns[row], places[row]), (turns[row + 1], places[row + 1]), gone - row)
 
     def _tabulated(self, pace: float) -> tuple[Float, Float]:
-        """Joints of a stride straight on at an even pace, and its first pose once more."""
+        """Joints of a stride straight ahead at constant pace; the last pose repeats the first."""
         rate = pace / self._step_length(pace)
         times = np.zeros(STRIDE_ROWS + 1)
         seconds = 1.0

@@ -72,7 +72,7 @@ class Sky:
         return sum(t.numel() * t.element_size() for t in self.tensors().values())
 
     def tensors(self) -> dict[str, Tensor]:
-        """Its tensors by name, without absent ones."""
+        """The tensors by name, without absent ones."""
         known = {} if self.uncertainties is None else {"uncertainties": self.uncertainties}
         return {"faces": self.faces, **known}
 
@@ -294,10 +294,10 @@ class Scene:
         object.__setattr__(self, "provenance", MappingProxyType(dict(self.provenance)))
 
     def object(self, object_id: str) -> SceneObject:
-        """The object of that id.
+        """The object with that id.
 
         Raises:
-            UnknownObjectError: with the ids there are.
+            UnknownObjectError: the id is unknown; the message lists the known ones.
         """
         try:
             return self.objects[object_id]

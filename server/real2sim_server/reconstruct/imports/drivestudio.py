@@ -1,7 +1,7 @@
 """Checkpoints of drivestudio (OmniRe and others), ``checkpoint_final.pth``.
 
-Source: github.com/ziyc/drivestudio, models/nodes, models/gaussians/vanilla.py, models/modules.py and
-datasets.
+Source: github.com/ziyc/drivestudio (models/nodes, models/gaussians/vanilla.py, models/modules.py,
+datasets).
 """
 
 from __future__ import annotations

@@ -31,7 +31,7 @@ KEYS_OF_VERSION_3 = {
     "buried_depth": "occluded_depth",
 }
 PRIORS_OF_VERSION_3 = "guesses."
-"""Version 3 has the same content under other names."""
+"""Prefix of the tensors of priors in checkpoints of version 3."""
 
 
 @dataclass(frozen=True, eq=False)

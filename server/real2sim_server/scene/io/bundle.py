@@ -144,7 +144,7 @@ def load_scene(
             sizes are checked.
 
     Raises:
-        BundleError: with the file and the reason: missing, cut short, changed, of another version.
+        BundleError: names the file and the reason: missing, truncated, changed, of another version.
     """
     folder = Path(path)
     document = read_container(folder, SceneDocument, verify=verify)
@@ -171,14 +171,14 @@ def load_scene(
 
 
 def load_ground(path: str | PathLike[str], content_hash: str) -> Ground:
-    """The ground of a scene bundle, without its scene. Shared with the loaded scene.
+    """The ground of a scene bundle, without the rest of the scene. Shared with the loaded scene.
 
     Args:
         path: folder of the bundle.
-        content_hash: that the bundle must have.
+        content_hash: expected hash of the bundle.
 
     Raises:
-        BundleError: as :func:`load_scene`, or it is another bundle by now.
+        BundleError: as :func:`load_scene`, or the hash has changed.
     """
     folder = Path(path)
     document = _document_of(folder, content_hash)
@@ -187,7 +187,7 @@ def load_ground(path: str | PathLike[str], content_hash: str) -> Ground:
 
 
 def load_lanes(path: str | PathLike[str], content_hash: str) -> LaneGraph | None:
-    """The lanes of a scene bundle, without its scene; None if it has none.
+    """The lanes of a scene bundle, without the rest of the scene; None without lanes.
 
     Args:
         path: folder of the bundle.
@@ -396,7 +396,7 @@ def _bounds(means: Tensor) -> Bounds | None:
 
 
 def _open(folder: Path, name: str, sizes: Mapping[str, int], verify: bool) -> TensorFile:
-    # Names come from here, never from scene.json, so no bundle can point outside its folder.
+    # File names are never read from scene.json, so a bundle cannot point outside its folder.
     if name not in sizes:
         raise BundleError(f"{folder}: scene.json does not list {name!r} under 'files'")
     return TensorFile(folder / name, nbytes=sizes[name], verify=verify)
@@ -530,7 +530,7 @@ def _read_ground(folder: Path, document: SceneDocument, *, verify: bool) -> Grou
 
 @contextmanager
 def _as_bundle_error(folder: Path) -> Iterator[None]:
-    """Name the bundle in errors about its content."""
+    """Add the name of the bundle to errors about its content."""
     try:
         yield
     except BundleError:
@@ -574,7 +574,7 @@ def stage_scene(source: Path, folder: Path, *, name: str, limits: StagingLimits)
     Raises:
         BundleTooLargeError: it takes more memory than the limits allow.
         BundleError: it cannot be read, or took too long.
-        SceneError: its values are no scene, or the bundle cannot be written.
+        SceneError: the values are not a valid scene, or the bundle cannot be written.
     """
     _staged("read_and_save_scene", source, folder, limits, {"name": name})
 
