@@ -29,7 +29,7 @@ from .perturbed import Perturbation
 
 # --- Rig -----------------------------------------------------------------------------------------
 
-# Sensors of a data set from a file: cameras of the scene or your own, and a LiDAR.
+# Sensors of a data set from a file: cameras of the scene, new cameras, and a LiDAR.
 
 Degrees = Annotated[float, Field(ge=-360, le=360)]
 
@@ -71,10 +71,10 @@ def read_rig(path: Path) -> dict[str, Any]:
 
 
 def cameras_of(values: Mapping[str, Any], rig: CameraRig) -> list[Camera]:
-    """The cameras that a rig file names, in its order.
+    """The cameras of a rig file, in order.
 
     Raises:
-        DatasetError: values that are no rig, a camera that the scene lacks, or the same name twice.
+        DatasetError: the values are invalid, the scene lacks a camera, or a name is not unique.
     """
     try:
         asked = Rig.model_validate(values).cameras
@@ -123,7 +123,7 @@ def _turn(asked: RigCamera) -> Any:
 
 # --- Variants ------------------------------------------------------------------------------------
 
-# The same drive many times, each with other values in its edits.
+# The same drive several times, with different values in its edits.
 
 MAX_VARIANTS = 1000
 _OPERATIONS: TypeAdapter[list[Operation]] = TypeAdapter(list[Operation])
@@ -307,10 +307,10 @@ def planned_cameras(drive: Drive, plan: ExportPlan) -> list[Camera]:
 
 
 def planned_lidar(plan: ExportPlan) -> Lidar | None:
-    """The LiDAR of a plan, on the roof where it is not placed itself.
+    """The LiDAR of a plan, on the roof unless the values contain a pose.
 
     Raises:
-        DatasetError: an unknown name, or values that are no sensor's.
+        DatasetError: an unknown name, or invalid values.
     """
     named = plan.lidar if plan.rig is None else plan.rig.get("lidar")
     if named is None:
@@ -326,7 +326,7 @@ def planned_lidar(plan: ExportPlan) -> Lidar | None:
 def planned_shards(variants: Sequence[Variant], plan: ExportPlan) -> list[PlannedClip]:
     """The clips of all drives, once per perturbation, with consecutive numbers.
 
-    All clips of one time section are in the same split, so test data is never trained on.
+    All clips of one time section are in the same split, which prevents training on test data.
 
     Raises:
         DatasetError: as :func:`planned_clips`, or too many frames in total.
@@ -345,11 +345,11 @@ def planned_shards(variants: Sequence[Variant], plan: ExportPlan) -> list[Planne
 
 
 def planned_clips(drive: Drive, plan: ExportPlan) -> list[PlannedClip]:
-    """All clips in their order.
+    """All clips in order.
 
     Raises:
-        DatasetError: for instants outside of the drive, a period or a length that give no frame,
-            too many frames, or shares that are none.
+        DatasetError: times outside the drive, a period or length without a frame, too many
+            frames, or invalid shares.
     """
     first, last = drive.span
     start = first if plan.start_us is None else plan.start_us

@@ -53,7 +53,7 @@ class SyntheticLog(DrivingLog):
             T_world_camera: [4, 4], OpenCV camera frame.
             k: [3, 3] intrinsics [px], pixel centres at +0.5.
             width, height: image size [px].
-            t_us: time [us]; outside the drive vehicles move straight on.
+            t_us: time [us]; outside the drive, vehicles continue straight ahead.
 
         Returns:
             RGB uint8 [H, W, 3]; depth float32 [H, W] along the camera's z [m], 0 in the sky;
@@ -114,7 +114,7 @@ class SyntheticLog(DrivingLog):
 
         Returns:
             RGB uint8 [H, W, 3]; distance from the camera float32 [H, W] [m], mean over a pixel's
-            rays, 0 where any of them meets the sky. Both are 0 where the lens sees nothing.
+            rays, 0 where any of them hits the sky. Both are 0 outside the lens's field of view.
         """
         source = self.source
         assert isinstance(source, SyntheticSource)
@@ -188,7 +188,7 @@ class SyntheticSource:
         roots: node [S] of each vehicle shape's mesh.
         body_paints: row [I] of each vehicle's body in the paint table.
         rig: as in the log.
-        people: in the world's arrays; None where there are none.
+        people: in the world's arrays; None without people.
     """
 
     config: SyntheticConfig
@@ -328,7 +328,7 @@ class SyntheticSource:
             root=people.roots(),
             shape=np.zeros(len(every), np.int64),
             paint=np.zeros(len(every), np.int64),
-            # What darkens the ground about them is their feet, not their box.
+            # Their feet darken the ground around them, not their box.
             half_size=np.column_stack([np.full((len(every), 2), 0.1), half[:, 2]]),
         )
 
@@ -450,7 +450,7 @@ def _sweep(points: Float, intensity: ArrayLike, offsets_us: ArrayLike) -> LidarS
 
 
 def generate_log(config: SyntheticConfig) -> SyntheticLog:
-    """The drive of ``config``; builds the world now, casts images on demand."""
+    """The drive of ``config``. Builds the world immediately, casts images on demand."""
     drive = plan_drive(config)
     paints: list[tuple[float, ...]] = []
     house_rng = np.random.default_rng([config.seed, 2])

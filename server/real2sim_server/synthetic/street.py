@@ -58,7 +58,7 @@ class SyntheticConfig:
         cameras: the rig.
         samples: rays per pixel along each image axis, at edges.
         moving_cars: number of moving vehicles, ahead of the ego vehicle and oncoming.
-        parked_cars: number of vehicles at the kerbs; fewer if the street has no room for more.
+        parked_cars: number of vehicles at the kerbs; fewer if the street has less room.
         speed: mean speed of the ego vehicle [m/s].
         lidar_beams, lidar_columns: beams, and azimuth steps per turn; 0 beams for no LiDAR.
         lidar_range: maximum range [m].

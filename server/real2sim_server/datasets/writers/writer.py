@@ -40,7 +40,7 @@ class LabelledDrive:
     lidar_position: tuple[float, float, float]
 
     def token(self, *parts: object) -> str:
-        """32 hexadecimal digits, the same for the same parts of the same export."""
+        """A token of 32 hexadecimal digits, derived from the export and the given parts."""
         text = "/".join((self.digest, *map(str, parts)))
         return hashlib.sha256(text.encode()).hexdigest()[:32]
 
@@ -55,13 +55,13 @@ class DatasetWriter(Protocol):
     """Description of the output in one line."""
 
     def write(self, drive: LabelledDrive, folder: Path) -> None:
-        """Fill the empty ``folder``: the same bytes for the same drive, whatever the machine, the
-        day or the folder."""
+        """Fill the empty ``folder``. The bytes must only depend on the drive, not on the machine,
+        the date or the folder."""
         ...
 
 
 def write_json(path: Path, content: Any) -> None:
-    """The same bytes for the same content."""
+    """Canonical JSON: the same content gives the same bytes."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
