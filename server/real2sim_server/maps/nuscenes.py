@@ -109,7 +109,7 @@ class _Tables:
         return found
 
     def stop_lines(self, lanes: list[Lane]) -> list[StopLine]:
-        """Stop lines along the long axes of their polygons, with the lanes that end or lie on them."""
+        """Stop lines along the long axes of their polygons, with their lanes."""
         graph = joined([lane for lane in lanes if lane.junction is None] or lanes)
         found = []
         for row in self.rows("stop_line"):

@@ -68,7 +68,9 @@ class Shutter:
         return self.direction in {"top_to_bottom", "bottom_to_top"}
 
     def line_times(self, width: int, height: int) -> NDArray[np.float64]:
-        """Exposure time of each row (or column), from 0 to 1 over the readout (as in NCore).
+        """Exposure time of each row (or column), from 0 to 1 over the readout.
+
+        As in NCore, the first is at 0 and the last at 1.
         """
         count = height if self.by_row else width
         times = np.arange(count) / max(count - 1, 1)

@@ -474,7 +474,7 @@ def lane_symmetric(s: Any, lane: Any) -> Any:
 
 @inner()
 def neo_hookean_batch(dt: Any, s: Any) -> None:
-    """Neo-Hookean stress of all lanes. Logarithms do not vectorise, so a separate loop computes them."""
+    """Neo-Hookean stress of all lanes. Logarithms do not vectorise and have a separate loop."""
     for lane in range(BATCH):
         F = advance_gradient(lane_matrix(s, _F, lane), lane_matrix(s, _L, lane), dt)
         for c in range(9):
