@@ -1,4 +1,4 @@
-"""The same physics in other frameworks: their interface, and which are installed."""
+"""The same physics in other frameworks: a common interface, and availability."""
 
 from __future__ import annotations
 

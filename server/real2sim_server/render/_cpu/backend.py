@@ -129,7 +129,7 @@ class CpuBackend:
 def _output(
     request: RasterRequest, images: Sequence[NDArray[Any]], timing: dict[str, float]
 ) -> RenderOutput:
-    """RenderOutput with the requested images out of RGB, alpha, depth, instance and median depth."""
+    """RenderOutput with the requested images of RGB, alpha, depth, instance and median depth."""
     options = request.options
     rgb, alpha, depth, instance, median = map(torch.from_numpy, images)
     return RenderOutput(

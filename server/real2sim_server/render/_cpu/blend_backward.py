@@ -328,7 +328,7 @@ to the record's centre."""
 
 
 class Losses(NamedTuple):
-    """Loss gradients with respect to the images of one camera; [0, 0] (rgb: [0, 0, 0]) if absent."""
+    """Loss gradients of the images of one camera; [0, 0] (rgb: [0, 0, 0]) if absent."""
 
     rgb: NDArray[np.float32]
     alpha: NDArray[np.float32]

@@ -289,7 +289,7 @@ class TrainingPasses:
     def backward(
         self, training: TrainingPass, images: tuple[Tensor, ...], losses: tuple[Tensor | None, ...]
     ) -> BackwardResult:
-        """Gradients with respect to placements, sky and clouds, from those of RGB, alpha and depth."""
+        """Gradients of placements, sky and clouds, from the gradients of RGB, alpha and depth."""
         result = BackwardResult(training.request)
         with self.lock:
             for camera in range(training.request.cameras):
