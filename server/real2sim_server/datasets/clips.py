@@ -104,7 +104,7 @@ class Clip:
         name: four digits.
         split: name of its split.
         frames: labels of each frame, see ``docs/datasets.md``.
-        values: of the parameters of a sweep.
+        values: parameter values of a sweep.
     """
 
     folder: Path
@@ -445,7 +445,7 @@ class ClipMakers:
         """Make each clip as a folder below ``folder``, created atomically and named after the clip.
 
         Args:
-            plan: of the export.
+            plan: plan of the export.
             clips: missing clips.
             folder: parent of the clips.
             on_frames: called with the number of frames of each finished clip.

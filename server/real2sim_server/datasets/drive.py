@@ -32,10 +32,10 @@ class Moment:
 
     Attributes:
         t_us: time [us].
-        instances: to render.
+        instances: instances to render.
         placed: all present objects.
         T_world_ego: [4, 4] pose of the ego (rear axle centre on the ground).
-        strides: of people without a trajectory, by object id.
+        strides: walking states of people without a trajectory, by object id.
     """
 
     t_us: int
@@ -132,7 +132,7 @@ class EpisodeDrive:
     """A recorded episode. Its times are those of its steps.
 
     Attributes:
-        scene: of the episode.
+        scene: scene of the episode.
         worlds: after each step, by time.
     """
 

@@ -41,7 +41,7 @@ class Perturbation:
 
     Attributes:
         lateral_sigma: standard deviation of the lateral offset [m].
-        heading_sigma: of the heading relative to the path [rad].
+        heading_sigma: standard deviation of the heading relative to the path [rad].
         recover_s: recovery time at the initial speed [s].
         copies: number of perturbed copies of each clip, with different starts.
     """

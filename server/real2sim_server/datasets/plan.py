@@ -134,8 +134,8 @@ class Variant:
     """One drive of a sweep.
 
     Attributes:
-        drive: to export.
-        values: of the parameters; empty without a sweep.
+        drive: drive to export.
+        values: parameter values; empty without a sweep.
     """
 
     drive: Drive
@@ -147,10 +147,10 @@ def swept(scene: Scene, state: ScenarioState, sweep: DatasetSweep, seed: int) ->
     of the distributions.
 
     Args:
-        scene: of the scenario.
+        scene: scene of the scenario.
         state: before the edits of the sweep.
         sweep: parameters, and edits in which ``"$name"`` is replaced by a value.
-        seed: of the samples.
+        seed: seed of the samples.
 
     Raises:
         DatasetError: more than MAX_VARIANTS, an edit without a parameter, parameters without an
@@ -238,7 +238,7 @@ class ExportPlan:
     Attributes:
         formats: names of writers, see :func:`~.writers.writer_names`.
         cameras: names; empty for all.
-        width: of images [px]; None for the cameras' own.
+        width: image width [px]; None for the cameras' widths.
         period_us: between frames [us].
         start_us, end_us: first and last time [us]; None for those of the drive.
         clip_s: length of a clip [s], the unit of writing, resuming and splitting.
@@ -249,7 +249,7 @@ class ExportPlan:
             cameras' depth.
         rig: values of a rig file, instead of ``cameras``, ``width`` and ``lidar``.
         perturb: distribution of the starts of clips; None: on the path.
-        noise: of a detector, written as additional boxes; None: no such boxes.
+        noise: error model of a detector, whose boxes are written in addition; None for none.
     """
 
     formats: tuple[str, ...]
@@ -280,7 +280,7 @@ class PlannedClip:
     Attributes:
         name: four digits.
         split: name of its split.
-        times_us: of its frames [us].
+        times_us: times of its frames [us].
         variant: index of its drive in the sweep.
         copy: index of its perturbed start; None if it starts on the path.
     """

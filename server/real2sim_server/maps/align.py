@@ -75,7 +75,7 @@ def align(
     """The rigid motion that aligns a map's lanes with the driven poses.
 
     Args:
-        graph: in the map's own frame.
+        graph: graph in the frame of the map.
         poses: [N, 3] x, y, heading in the scene; see :func:`driven_poses`.
         start: (yaw, x, y) to start from; None: the map's own frame if it almost fits, otherwise
             all possible positions of the first pose on the map.

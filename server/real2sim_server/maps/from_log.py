@@ -1,4 +1,4 @@
-"""Lanes of a log: from its map, or from the drive alone if there is none."""
+"""Lanes of a log, from its map or, without a map, from the drive."""
 
 from __future__ import annotations
 

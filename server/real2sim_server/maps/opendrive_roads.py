@@ -36,7 +36,7 @@ class Piece:
 
     Attributes:
         s: start position on the road [m].
-        length: of the piece [m].
+        length: length of the piece [m].
         x, y, heading: pose of its start.
         local: its shape.
         bends: whether it is not a straight line.
@@ -311,7 +311,7 @@ class SectionLane:
 
     Attributes:
         number: negative to the right of the reference line.
-        kind: of the lane.
+        kind: kind of the lane.
         inner, outer: [M] t of its borders at the section's positions [m].
         links: numbers of connected lanes, by "predecessor" and "successor".
         speed_limit: [m/s] or None.

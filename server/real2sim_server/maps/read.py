@@ -53,7 +53,7 @@ def register_map_reader(reader: MapReader) -> None:
     """Register a reader from outside this package for :func:`read_map`.
 
     Args:
-        reader: of a format that no other reader recognises.
+        reader: reader of a format that no other reader recognises.
 
     Raises:
         ValueError: a reader with that name is registered.

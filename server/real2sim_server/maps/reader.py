@@ -21,7 +21,7 @@ class MapReader(Protocol):
     """Reads one format of maps.
 
     Attributes:
-        name: of the format, for ``read_map(format=...)``.
+        name: name of the format, for ``read_map(format=...)``.
         expects: one line for users with the required file or folder.
     """
 
@@ -99,7 +99,7 @@ def read_xml(path: Path, root: str) -> ET.Element:
     """The root element of an XML file.
 
     Args:
-        path: of the file.
+        path: path of the file.
         root: expected name of the element.
 
     Raises:

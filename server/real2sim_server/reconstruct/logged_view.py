@@ -45,7 +45,7 @@ def points_in_camera(
     vehicles is not compensated: it is a few decimetres at most, on few points.
 
     Args:
-        sweep: of ``frame``; None reads it.
+        sweep: sweep of ``frame``; None reads it.
     """
     T_world_vehicle = log.ego.transform(int(log.frame_times_us[frame]))
     T_camera_vehicle = camera.viewmat(log.ego.transform(t_us)) @ T_world_vehicle
@@ -71,7 +71,7 @@ def tracks_mask(
     Occlusion by other objects is ignored.
 
     Args:
-        tracks: with the boxes.
+        tracks: tracks with the boxes.
         camera: gives size and K.
         T_world_camera: [4, 4], OpenCV camera frame.
         t_us: time [us]; a track just outside its time span counts, see
@@ -196,11 +196,11 @@ def sky_mask(
     """Sky pixels [H, W] of an image of a log; none without LiDAR.
 
     Args:
-        log: with poses.
-        camera: of ``log``, at the size of ``image``.
-        frame: of ``log``.
+        log: log with poses.
+        camera: camera of ``log``, at the size of ``image``.
+        frame: frame of ``log``.
         image: [H, W, 3] RGB.
-        sweep: of ``frame``; None reads it.
+        sweep: sweep of ``frame``; None reads it.
 
     Raises:
         LogError: the sweep cannot be read.

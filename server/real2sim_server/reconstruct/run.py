@@ -40,7 +40,7 @@ class TrainingFigures:
         psnr_objects: PSNR over the boxes of moving objects in these views [dB].
         held_out_frames: frames used neither in stage 0 nor in training.
         stage_ms: time per step by stage [ms].
-        folder: with checkpoint, metrics and preview pictures.
+        folder: folder with checkpoint, metrics and preview pictures.
     """
 
     iterations: int
@@ -62,7 +62,7 @@ class ReconstructReport:
     Attributes:
         scene: folder of the bundle.
         preview: PNG of a logged image above its rendered view.
-        frames, cameras: of the log.
+        frames, cameras: numbers of frames and cameras of the log.
         objects: number of objects.
         gaussians: number in background and objects.
         background_gaussians: number in the background.
@@ -100,7 +100,7 @@ class ReconstructOptions:
         training: None builds from LiDAR without training.
         box_noise: noise added to the boxes of the log, for measuring its correction by training;
         see ``with_box_noise``.
-        backend: of the renderer; training runs on its device.
+        backend: backend of the renderer; training runs on its device.
     """
 
     initialise: InitialiseOptions | None = None

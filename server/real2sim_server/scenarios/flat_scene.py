@@ -56,7 +56,7 @@ def fitted_to_scene(
     Args:
         board: the storyboard. If the scene has no map, its road network is assumed to be straight
             with lanes 3.5 m wide.
-        scene: to run it on.
+        scene: scene for the run.
         start_us: start of the episode [us]; None: start of the recording.
 
     Raises:

@@ -31,7 +31,7 @@ class Asset:
         cloud: Gaussians in the object frame: origin at the box centre, x forward, z up.
         provenance: origin of the asset (JSON values only).
         content_hash: SHA-256 of the bundle on disk; empty if not saved.
-        figure: of a walking person, with ``cloud`` in the rest pose; or None.
+        figure: figure of a walking person, with ``cloud`` in the rest pose; or None.
 
     Raises:
         SceneError: ``size`` is not three positive lengths, or the figure belongs to another cloud.
@@ -104,7 +104,7 @@ def person_asset(
     Args:
         asset_id: name of the asset.
         build: a build of the body model, for example ``woman`` or ``boy``.
-        height: of the person [m]; default: height of the build.
+        height: height of the person [m]; by default that of the build.
         clothes: colours that differ from ``CLOTHES``.
         worn: garments from ``WORN``.
         gaussians: number of Gaussians.

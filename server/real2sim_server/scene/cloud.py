@@ -282,7 +282,7 @@ class GaussianCloud:
         directions.
 
         Args:
-            factors: of x, y and z, > 0.
+            factors: factors along x, y and z, > 0.
 
         Raises:
             SceneError: a factor is not positive.

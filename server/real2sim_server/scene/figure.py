@@ -129,7 +129,7 @@ class Figure:
 
     Attributes:
         shape: [<= 12] coefficients of the body model's shapes.
-        height: of the body [m].
+        height: height of the body [m].
         middle: height of the object's origin above the body's, which is on the ground [m].
         joints: [N, 4] uint8, joints that move a Gaussian.
         weights: [N, 4] float32 of these joints; each row sums to one.
@@ -238,8 +238,8 @@ class Figure:
         """``cloud`` in its pose at ``t_us`` along ``trajectory``.
 
         Args:
-            cloud: in the rest pose, frame of the object.
-            trajectory: of the object; its origin is ``middle`` above the ground.
+            cloud: cloud in the rest pose, frame of the object.
+            trajectory: trajectory of the object; its origin is ``middle`` above the ground.
             t_us: time [us]; outside the trajectory, the pose at its nearer end is used.
 
         Returns:
@@ -252,7 +252,7 @@ class Figure:
         """``cloud`` walking straight on, for callers that move it themselves.
 
         Args:
-            cloud: in the rest pose, frame of the object.
+            cloud: cloud in the rest pose, frame of the object.
             stride: walking state.
         """
         return self._binding.posed(cloud, *self._stride_joints(stride))
@@ -277,7 +277,7 @@ class Figure:
         """COCO's 17 keypoints [17, 3], frame of the object [m].
 
         Args:
-            trajectory: of the object.
+            trajectory: trajectory of the object.
             t_us: instant on the trajectory [us].
             stride: walking state, in place of the trajectory.
         """

@@ -328,9 +328,9 @@ def occupied_cells(background: GaussianCloud, ground: Ground, path: EgoPath) -> 
     opacity, between 0.4 and 1.6 m above the ground. The corridor of the recording vehicle is free.
 
     Args:
-        background: of a scene.
-        ground: of the same scene.
-        path: of the recording vehicle.
+        background: background of a scene.
+        ground: ground of the same scene.
+        path: path of the recording vehicle.
     """
     opaque = (background.opacities > OBSTACLE_OPACITY).cpu().numpy()
     points = background.means.cpu().numpy().astype(np.float64)[opaque]

@@ -90,9 +90,9 @@ class Level(NamedTuple):
     """One pass of the fit.
 
     Attributes:
-        cell: of its grid [m].
+        cell: cell size of its grid [m].
         tolerance: points within this distance of the previous level are on the ground [m].
-        growth: of the tolerance with distance from the drive.
+        growth: growth of the tolerance with the distance from the drive.
         fraction: quantile of a cell's heights that is used. Objects are never below the ground,
             and the lowest point of all is noise. Coarse cells contain walls, whose feet are used.
     """
@@ -364,7 +364,7 @@ class RoadPlane:
 
     Attributes:
         normal: [3] unit, upwards.
-        offset: of its points along the normal [m].
+        offset: offset of its points along the normal [m].
         candidates: [K] indices of the points around the projected boxes.
         inliers: [K] bool, candidates on the plane.
         rms: distance of inliers from the plane, root mean square [m].
@@ -389,7 +389,7 @@ def find_road_plane(
     Args:
         points: [N, 3] of the background, world [m].
         boxes: (``T_world_box`` [4, 4], (length, width, height)) of objects on the road.
-        seed: of RANSAC's samples; the same seed gives the same plane.
+        seed: seed of RANSAC's samples; the same seed gives the same plane.
 
     Raises:
         SceneError: no boxes, fewer than three points around them, or no nearly level plane.

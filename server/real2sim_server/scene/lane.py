@@ -26,7 +26,7 @@ class RoadLane:
     """A section of a numbered lane of a road.
 
     Attributes:
-        number: of the lane: negative to the right of the reference line, positive to its left.
+        number: number of the lane, negative to the right of the reference line, else positive.
         lane_id: the corresponding lane of the graph.
         s: [M] float64, increasing positions along the road [m], M >= 2.
         inner: [M] float64, t of the border towards the reference line [m].
@@ -161,9 +161,9 @@ class Road:
         """x, y, z [m] and heading [rad] of the centre of lane ``number`` at ``s``.
 
         Args:
-            number: of the lane.
+            number: number of the lane.
             s: along the road [m].
-            offset: to the left of the reference line's direction [m].
+            offset: offset to the left of the reference line's direction [m].
 
         Raises:
             SceneError: the road has no lane ``number`` at ``s``.
@@ -231,7 +231,7 @@ class LanePlace(NamedTuple):
         lane_id: the lane.
         s: arc length along its centre line, seen from above [m].
         offset: distance from it, positive to the left [m].
-        heading: of the lane there [rad].
+        heading: heading of the lane there [rad].
         inside: whether the position is between the lane's borders.
     """
 
@@ -403,8 +403,8 @@ class Signal:
         position: x, y, z in the world [m].
         heading: direction that its face looks in [rad].
         lanes: controlled lanes.
-        stop_line: of their traffic; None: at the lanes' ends.
-        value: of a speed limit [m/s], else None.
+        stop_line: stop line of their traffic; None for the ends of the lanes.
+        value: value of a speed limit [m/s], else None.
     """
 
     signal_id: str

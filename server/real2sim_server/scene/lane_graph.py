@@ -313,7 +313,7 @@ class LaneGraph:
         """A graph of parts, stored by their ids.
 
         Args:
-            lanes: of the graph.
+            lanes: lanes of the graph.
             **parts: iterables ``areas``, ``stop_lines``, ``signals``, ``roads``; and ``source``,
                 ``accuracy``, ``geo_reference``.
 
@@ -400,7 +400,7 @@ class LaneGraph:
         Args:
             x, y: world position [m].
             heading: preferred direction of the lane [rad]; None: any direction.
-            kinds: of lanes to consider.
+            kinds: kinds of lanes to consider.
             within: maximum distance from a centre line [m].
         """
         place = np.array([[x, y, math.nan if heading is None else heading]])
@@ -454,7 +454,7 @@ class LaneGraph:
 
         Args:
             lane_id: first lane.
-            length: of each route, unless its lanes end before [m].
+            length: length of each route, unless its lanes end before [m].
             s: start on the first lane [m].
             limit: maximum number of routes, in order of discovery.
 
@@ -476,11 +476,11 @@ class LaneGraph:
         return found
 
     def route(self, start: str, goal: str, *, change_cost: float = 20.0) -> tuple[str, ...] | None:
-        """The shortest route from one lane to another, or None.
+        """The shortest route from one lane to another; None if there is no route.
 
         Args:
             start, goal: lanes.
-            change_cost: of a lane change to a neighbour of the same direction [m].
+            change_cost: cost of a lane change to a neighbour of the same direction [m].
 
         Raises:
             SceneError: there is no such lane.

@@ -32,7 +32,7 @@ class Reflector:
     """Gaussians as a LiDAR sees them.
 
     Attributes:
-        cloud: in the frame of the background or of the object.
+        cloud: cloud in the frame of the background or of the object.
         attributes: [N, 2] float32: reflectivity at normal incidence, 0 to MAX_REFLECTIVITY, and
             share of lost rays, 0 to 1.
 
@@ -137,11 +137,11 @@ class LidarSurfaces:
     """The second set of Gaussians of a scene, for LiDARs.
 
     Attributes:
-        background: in the world.
+        background: background in the world frame.
         objects: by object id, in the object's frame; a missing object shows its own Gaussians.
         incidence: share of reflected light that is independent of the incidence, 0 to 1; the rest
             is proportional to the cosine.
-        response: of the sensor that recorded the log, if its scans have rings.
+        response: response of the sensor that recorded the log, if its scans have rings.
 
     Raises:
         SceneError: a share outside 0 to 1.

@@ -194,7 +194,7 @@ class Lidar:
         name: unique on its vehicle.
         beams: directions and times of the rays.
         T_vehicle_lidar: [4, 4] float64, sensor frame x forward, y left, z up.
-        min_range, max_range: of returns [m]; nearer surfaces are invisible and occlude nothing.
+        min_range, max_range: range of returns [m]; nearer surfaces are invisible and transparent.
         divergence: (horizontal, vertical) full angle of a beam at 1/e^2 of its power [rad]; its
             standard deviation on a surface is a quarter of its diameter there.
         returns: 1 (the median of the light), 2 (first and last) or 3 (and the strongest).

@@ -56,8 +56,8 @@ def street_scene(
 
     Args:
         count: at least 100,000; a larger number makes the street longer.
-        width, height: of the camera [px]; its horizontal field of view is 56 degrees.
-        seed: of all noise.
+        width, height: image size of the camera [px]; its horizontal field of view is 56 degrees.
+        seed: seed of all noise.
     """
     rng = np.random.default_rng(seed)
     car = surfels_to_cloud(car_surfels(rng), rng)
@@ -236,7 +236,7 @@ def street(name: str, *, gaussians: int, width: int, height: int) -> Scene:
     """A straight street with parked cars; the ego drives along it at 8 m/s for 20 s.
 
     Args:
-        name: of the scene.
+        name: name of the scene.
         gaussians: total number, including parked cars.
         width, height: image size of its only camera, ``front`` [px].
     """

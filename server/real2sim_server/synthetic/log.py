@@ -108,8 +108,8 @@ class SyntheticLog(DrivingLog):
 
         Args:
             camera: lens, shutter, K and size.
-            motion: of the camera over the read-out.
-            t_us: time of the middle of the read-out.
+            motion: motion of the camera over the read-out.
+            t_us: time of the middle of the read-out [us].
             samples: rays per pixel along each image axis.
 
         Returns:
@@ -151,7 +151,7 @@ class SyntheticLog(DrivingLog):
         Args:
             T_world_camera, T_world_next: [4, 4], camera poses in both.
             k, width, height: as in :meth:`render`.
-            times_us: of both.
+            times_us: times of both [us].
 
         Returns:
             [H, W, 2] float32, motion of the surface at a pixel's centre [px], even if it is then
@@ -166,7 +166,7 @@ class SyntheticLog(DrivingLog):
         """The true sweep of a LiDAR on the vehicle about ``t_us`` [us], without noise or losses.
 
         Args:
-            lidar: with [B, C] rays and one time per column.
+            lidar: LiDAR with [B, C] rays and one time per column.
             t_us: time stamp of the sweep.
 
         Returns:
@@ -182,7 +182,7 @@ class SyntheticSource:
     """Casts the rays of a synthetic drive.
 
     Attributes:
-        config: of the drive.
+        config: configuration of the drive.
         world: surroundings and vehicle shapes.
         drive: vehicles, then people, in the order of the log's tracks.
         roots: node [S] of each vehicle shape's mesh.
@@ -512,7 +512,7 @@ def synthesize(
     """Generate a drive and write it in the native layout to the new folder ``out``.
 
     Args:
-        config: of the drive.
+        config: configuration of the drive.
         out: a folder that is new or empty.
         on_progress: called with (done, total) after each image and each sweep.
 

@@ -367,9 +367,9 @@ def body_surface(shape, roof, i, paint, p, number, x, y, z, nx, ny, f):
         roof: table of roof lines, heights at even steps from rear to front [m].
         i: row of both.
         paint, p: paint table and the row of the body's colour.
-        number: of the vehicle, for its plates.
+        number: number of the vehicle, for its plates.
         x, y, z: the point; z from the ground [m].
-        nx, ny: of the surface normal.
+        nx, ny: components of the surface normal.
         f: size of a pixel there [m].
     """
     length, height, belt = shape[i, 0], shape[i, 2], shape[i, 3]

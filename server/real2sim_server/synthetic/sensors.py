@@ -102,7 +102,7 @@ class RaycastWorld(NamedTuple):
         paints: [P, 8] paint table.
         shapes: [S, 16] measures of vehicle shapes.
         roofs: [S, n] their roof lines [m].
-        seed: of the textures.
+        seed: seed of the textures.
     """
 
     bounds: Float

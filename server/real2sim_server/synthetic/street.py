@@ -30,7 +30,7 @@ class CameraSpec:
         name: unique on the rig.
         yaw: viewing direction about the vehicle's z axis [rad], 0 = ahead, positive = left.
         fov: horizontal field of view [rad].
-        position: in the vehicle frame [m].
+        position: position in the vehicle frame [m].
     """
 
     name: str
@@ -51,7 +51,7 @@ class SyntheticConfig:
     """Configuration of a synthetic drive; the same values give the same bits.
 
     Attributes:
-        seed: of all randomness: street, traffic, textures, LiDAR noise.
+        seed: seed of all randomness: street, traffic, textures, LiDAR noise.
         frames: number of frames.
         hz: frames per second, and turns of the LiDAR per second.
         width, height: image size of every camera [px].

@@ -63,7 +63,7 @@ class House:
         shop: whether the ground floor is a shop.
         wall, trim, frame, roof, front: rows of the paint table.
         recess: depth of the windows behind the wall [m].
-        depth: of the house [m].
+        depth: depth of the house [m].
     """
 
     floors: int

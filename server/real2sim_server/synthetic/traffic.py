@@ -122,7 +122,7 @@ def plan_people(
     """People and cyclists, in this order.
 
     Args:
-        config: of the drive.
+        config: configuration of the drive.
         street: its course.
         times_us: [F] frames [us].
         traffic: path, length and width [m] of all moving and parked vehicles.
@@ -411,7 +411,7 @@ class PlannedVehicle:
 
     Attributes:
         shape: index into ``vehicles.SHAPES``.
-        colour: of the body, linear RGB.
+        colour: colour of the body, linear RGB.
         trajectory: ``T_world_object`` of its box.
     """
 

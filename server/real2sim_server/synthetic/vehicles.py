@@ -27,8 +27,8 @@ class VehicleShape:
     """Measures of a body; lengths in metres, x from the middle, z from the ground.
 
     Attributes:
-        name: of the shape.
-        category: of the track.
+        name: name of the shape.
+        category: category of the track.
         size: (length, width, height).
         roof: (x / length, z / height) along the top, from rear to front.
         belt: height of the window sill.
@@ -36,7 +36,7 @@ class VehicleShape:
         windscreen: x / length of its foot and its top edge.
         rear_window: x / length of its foot and its top edge; equal values for none.
         axles: x / length of the rear and the front axle.
-        wheel_radius, clearance: of wheels, and below the sill.
+        wheel_radius, clearance: radius of the wheels, and clearance below the sill.
         pillars: number of pillars between the side windows.
         boxiness: exponent of the roof's cross-section, small for boxy.
         cargo: x / length from and to of a box behind the cab; equal values for none.

@@ -324,7 +324,7 @@ def first_occupied(way, size, spacing, origin, cell, occupied, sums):
 
 @kernel
 def holds_any(way, reach, origin, cell, sums):
-    """Whether the bounding rectangle of a motion, grown by ``reach`` [m], contains an occupied cell.
+    """Whether the bounds of a motion, grown by ``reach`` [m], contain an occupied cell.
 
     See :func:`first_occupied`.
     """

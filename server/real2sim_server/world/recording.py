@@ -343,7 +343,7 @@ def record(
         scene_hash: hash of the scene's bundle.
         scenario: id and revision.
         state: state of that scenario.
-        no_action_impact: for NeuroNCAP, see :func:`~.replay.no_action_impact`.
+        no_action_impact: value for NeuroNCAP, see :func:`~.replay.no_action_impact`.
     """
     instants: list[Instant] = []
     digests: list[str] = []

@@ -104,7 +104,7 @@ def _ahead(corners: Float) -> Float:
 
 
 def cut_at_border(box: Box2D, width: int, height: int) -> Box2D | None:
-    """The part of a box inside an image; None if there is none."""
+    """The part of a box inside an image, or None."""
     left, top, right, bottom = box
     cut = (max(left, 0.0), max(top, 0.0), min(right, float(width)), min(bottom, float(height)))
     return cut if cut[0] < cut[2] and cut[1] < cut[3] else None
@@ -136,7 +136,7 @@ class BoxNoise:
 
     Attributes:
         position: standard deviation of each coordinate of the centre [m].
-        size: of each edge, relative to its length.
+        size: standard deviation of each edge, relative to its length.
         heading: [rad].
         missed: share of missed boxes.
         false: mean number of false positives per frame.
@@ -156,9 +156,9 @@ def noisy_boxes(
     detections).
 
     Args:
-        boxes: of the frame.
+        boxes: boxes of the frame.
         in_ego: their poses [4, 4] in the ego frame.
-        noise: of the detector.
+        noise: error model of the detector.
         seed: seed of the noise.
     """
     rng = np.random.default_rng(list(seed))

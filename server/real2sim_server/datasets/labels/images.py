@@ -138,7 +138,7 @@ class CameraImages:
     """Images of one camera.
 
     Attributes:
-        camera: of the images.
+        camera: the camera.
         T_world_camera: [4, 4] its pose, OpenCV.
         rgb: [H, W, 3] uint8.
         depth: [H, W] float32, along the camera's z axis [m], 0 for empty pixels.

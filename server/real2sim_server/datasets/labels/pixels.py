@@ -168,7 +168,7 @@ def tell_apart(depth, instance, semantic, rays, slots, bodies, classes, behind, 
         bodies: [K, BODY] see shows_surface.
         classes: [65536] uint8, by instance id.
         behind: class of empty pixels.
-        heights, frame: of the ground.
+        heights, frame: grid of the ground.
     """
     x0, y0, per_cell = frame[0], frame[1], 1.0 / frame[2]
     for row in prange(depth.shape[0]):

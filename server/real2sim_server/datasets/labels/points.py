@@ -283,6 +283,6 @@ def _classes(
 
 
 def _each(transforms: Float, points: Float) -> Float:
-    """Points [N, 3], each transformed by its own matrix [N, 4, 4]."""
+    """Points [N, 3], transformed row by row by [N, 4, 4]."""
     moved: Float = np.einsum("nij,nj->ni", transforms[:, :3, :3], points) + transforms[:, :3, 3]
     return moved

@@ -65,11 +65,11 @@ class ObjectView:
     """One object in one image.
 
     Attributes:
-        object_id, instance_id: of the object.
+        object_id, instance_id: ids of the object.
         amodal_box: bounds of the projected 3D box, clipped to near plane and image [px].
         modal_box: bounds of the object's visible pixels [px]; None without any.
-        visible_pixels: of the object in the scene.
-        alone_pixels: of the object in this image without other objects.
+        visible_pixels: number of the object's visible pixels.
+        alone_pixels: number of its pixels in this image without other objects.
         truncation: share of the projected box outside the image, 0 to 1.
     """
 
@@ -105,8 +105,8 @@ def views_of(
     """Views of all objects with a box in the image.
 
     Args:
-        images: of the camera.
-        boxes: of all objects at this time.
+        images: images of the camera.
+        boxes: boxes of all objects at this time.
         instances: rendered instances.
         backend: renders single objects.
     """
@@ -218,10 +218,10 @@ def keypoints_at(
     """Keypoints [17, 3] of all walking people, world frame [m], by object id.
 
     Args:
-        scene: of the objects.
+        scene: scene of the objects.
         placed: their poses.
         t_us: time [us].
-        strides: of people without a trajectory.
+        strides: walking states of people without a trajectory.
     """
     found = {}
     for subject, transform in zip(placed.objects, placed.transforms, strict=True):
@@ -242,9 +242,9 @@ def keypoints_in_image(
     have position 0, 0.
 
     Args:
-        points: of one person.
-        images: of the camera.
-        instance_id: of the person's pixels.
+        points: keypoints of one person [m].
+        images: images of the camera.
+        instance_id: id of the person's pixels.
     """
     local = apply_transform(invert_transform(images.T_world_camera), points)
     depths = local[:, 2]

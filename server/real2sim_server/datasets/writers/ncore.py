@@ -39,7 +39,7 @@ class ZarrStore:
     """A store that is written once, starting at its root.
 
     Args:
-        folder: of the store; newly created.
+        folder: folder of the store; newly created.
     """
 
     def __init__(self, folder: Path) -> None:

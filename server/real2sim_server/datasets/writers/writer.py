@@ -18,15 +18,15 @@ class LabelledDrive:
     """Input of writers.
 
     Attributes:
-        name: of the data set.
+        name: name of the data set.
         digest: SHA-256 of its inputs; tokens are derived from it.
-        cameras: in order, at the size of the images.
+        cameras: cameras in order, at the size of the images.
         ego_size: (length, width, height) of the ego [m].
-        period_us: between frames [us].
-        clips: in order.
-        ground: of the scene.
+        period_us: time between frames [us].
+        clips: clips in order.
+        ground: ground of the scene.
         licence: terms of use.
-        lidar_position: of the LiDAR, in the ego frame [m].
+        lidar_position: position of the LiDAR in the ego frame [m].
     """
 
     name: str

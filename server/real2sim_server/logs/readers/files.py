@@ -82,7 +82,7 @@ class Tables:
         return self._rows[name]
 
     def row(self, name: str, token: str) -> Mapping[str, Any]:
-        """The row with a token. Raises LogError if there is none."""
+        """The row with a token. Raises LogError if it is missing."""
         try:
             return self._by_token[name][token]
         except (KeyError, TypeError):

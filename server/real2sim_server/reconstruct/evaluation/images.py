@@ -138,8 +138,8 @@ class SideScore:
     """One view of one vehicle against the truth, over the pixels that show it in the truth.
 
     Attributes:
-        object_id: of the vehicle.
-        azimuth: of the camera about the vehicle [rad], 0 in front, pi behind.
+        object_id: id of the vehicle.
+        azimuth: azimuth of the camera about the vehicle [rad], 0 in front, pi behind.
         seen: whether a camera of the log saw this side.
         psnr: [dB]; missing pixels count as black.
         coverage: fraction of the pixels with a rendered part of the vehicle.

@@ -77,7 +77,7 @@ def depth_errors(depth: NDArray[np.float32], points: Float, camera: Camera) -> N
     Args:
         depth: [H, W] along the camera's z [m], 0 in empty pixels.
         points: [N, 3] in the camera frame [m].
-        camera: of the image.
+        camera: camera of the image.
     """
     row, column, expected = seen_points(points, camera)
     rendered = depth[row, column].astype(np.float64)
@@ -122,7 +122,7 @@ class CoverageScore:
     """One rendered view against its logged image.
 
     Attributes:
-        camera, frame: of the view.
+        camera, frame: camera and frame of the view.
         psnr: over all pixels [dB].
         psnr_lidar: over the pixels that LiDAR covers [dB]; nan without such pixels.
         lidar_fraction: fraction of pixels that LiDAR covers, 0 to 1.
@@ -168,8 +168,8 @@ def evaluate_views(
         scene: reconstructed from ``log``.
         frames: indices of frames.
         cameras: names; all by default.
-        width: of the compared images [px]; the logged width by default.
-        backend: of the renderer.
+        width: width of the compared images [px]; the logged width by default.
+        backend: backend of the renderer.
 
     Raises:
         ReconstructError: no frames or no cameras were named, or the scene lacks a frame.
@@ -240,7 +240,7 @@ class SweepScore:
     """One sweep, or means over several.
 
     Attributes:
-        frame: of the log; -1 for means.
+        frame: frame of the log; -1 for means.
         rays: number of compared rays.
         median_m, median_squared_m2, p90_m: absolute error of the range where both return.
         expected_m: median absolute error of the mean range of the light, which reveals haze.
@@ -248,7 +248,7 @@ class SweepScore:
         f_score: share of points within 5 cm of the other cloud, mean of both directions.
         hit_miss: share of rays with a correct hit or miss. For a recorded sweep, where all rays
         returned, the share that hit.
-        intensity_rmse: of the reflectivity where both return.
+        intensity_rmse: root mean square error of the reflectivity where both return.
         drop_accuracy: share of rays whose return or loss is predicted correctly; nan if the lost
         rays are unknown.
     """
@@ -275,7 +275,7 @@ class LidarScore:
         chamfer: convention of the distance between two clouds.
         mean: over all sweeps.
         sweeps: one score per sweep.
-        ring_residual_deg: of the fitted beam table; nan if none was fitted.
+        ring_residual_deg: residual of the fitted beam table [deg]; nan without one.
     """
 
     against: str

@@ -105,7 +105,7 @@ class RenderRate:
         frames_per_second: camera images per second, colour only, all cameras in one call: number
             of cameras divided by the median duration of a call.
         cameras: number of cameras.
-        seconds: of each measured call.
+        seconds: duration of each measured call.
     """
 
     frames_per_second: float

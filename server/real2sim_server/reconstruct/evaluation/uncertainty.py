@@ -97,10 +97,10 @@ def fit_uncertainties(
     Held-out frames are not used.
 
     Args:
-        scene: made from ``log``.
+        scene: scene made from ``log``.
         log: the same part of it.
         views: maximum number of images, evenly spread over all of them.
-        backend: of the renderer; it must support gradients.
+        backend: backend of the renderer; it must support gradients.
         on_view: called with the number of finished views and of all views.
 
     Raises:
@@ -255,10 +255,10 @@ def evaluate_uncertainty(
     """Compare rendered uncertainty with errors; None if the scene has no uncertainties.
 
     Args:
-        scene: with uncertainties.
+        scene: scene with uncertainties.
         log: the log that the scene was made from.
         views: cameras and frames, of which at most MAX_VIEWS, evenly spread, are used.
-        backend: of the renderer.
+        backend: backend of the renderer.
 
     Raises:
         LogError: an image cannot be read.

@@ -173,11 +173,11 @@ class CheckpointOptions:
         cameras: training cameras. Default: 0, 1, 2 for Street Gaussians, as in its code; all
             cameras in the folder for drivestudio.
         tracker: whether Street Gaussians used tracks from a tracker (``use_tracker``).
-        fourier_scale: of Street Gaussians' time-varying colours.
-        frame_rate: of a drivestudio log [Hz]; its checkpoints contain no times.
-        world: of a drivestudio checkpoint: axes of its world. ``vehicle`` (x forward, z up) for
+        fourier_scale: scale of Street Gaussians' time-varying colours.
+        frame_rate: frame rate of a drivestudio log [Hz]; checkpoints contain no times.
+        world: world axes of a drivestudio checkpoint. ``vehicle`` (x forward, z up) for
             Waymo, Argoverse and KITTI, ``front_camera`` (x right, y down) for nuScenes.
-        name: of the scene; default: the name of the dataset folder, otherwise of the file.
+        name: name of the scene; by default the dataset folder's, otherwise the file's.
     """
 
     dataset: Path | None = None
@@ -255,7 +255,7 @@ def array(
     """A tensor of ``part`` as float64.
 
     Args:
-        path, what: for messages.
+        path, what: file and name of the tensor, for messages.
         part: table with the tensor.
         key: its name.
         shape: expected shape, None for any size.

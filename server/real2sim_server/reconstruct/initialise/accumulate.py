@@ -179,7 +179,7 @@ class ScanLimit:
 
     Attributes:
         path: [P, 3] float64, positions of the vehicle in the world [m].
-        height: of the scanner over the vehicle's origin [m].
+        height: height of the scanner above the vehicle's origin [m].
         slope: tangent of the elevation of its highest ray.
     """
 
@@ -193,7 +193,7 @@ def continue_walls(structure: Surfels, limit: ScanLimit, *, max_count: int) -> S
 
     Args:
         structure: objects above the ground, world frame.
-        limit: of the scanner.
+        limit: highest rays of the scanner.
         max_count: maximum number; the spacing grows if needed.
     """
     columns = _wall_columns(structure, limit)

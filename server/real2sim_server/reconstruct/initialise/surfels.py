@@ -178,7 +178,7 @@ def spread_ground(fit: GroundFit, spacing: float, limit: int) -> GroundPoints:
     """Cover the ground with a square grid that coarsens with the distance from the drive.
 
     Args:
-        fit: of the ground; points are on its surface as measured.
+        fit: fit of the ground; points are on its measured surface.
         spacing: distance between points near the drive [m].
         limit: maximum number of points; the grid coarsens to stay below it.
     """

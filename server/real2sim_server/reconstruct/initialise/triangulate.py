@@ -86,7 +86,7 @@ def triangulate(log: DrivingLog, *, max_images: int, on_image: _Progress) -> Tri
     bit for bit.
 
     Args:
-        log: with calibrated cameras and poses.
+        log: log with calibrated cameras and poses.
         max_images: maximum number per camera, evenly spread.
         on_image: called with the number of finished images and of all images.
     """
@@ -334,7 +334,7 @@ def sweep_planes(log: DrivingLog, *, max_images: int, on_image: _Progress) -> ND
     """Points [N, 3] float32 of the static scene above the LiDAR's field of view, world frame [m].
 
     Args:
-        log: with calibrated cameras and poses; cameras other than pinholes are skipped.
+        log: log with calibrated cameras and poses; only pinhole cameras are used.
         max_images: maximum number per camera, evenly spread.
         on_image: called with the number of finished images and of all images.
     """

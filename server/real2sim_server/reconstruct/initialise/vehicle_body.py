@@ -126,8 +126,8 @@ def fitted_body(
 
     Args:
         measured: [N, 3] in the object frame [m].
-        size: of the box [m].
-        category: of the track.
+        size: size of the box [m].
+        category: category of the track.
     """
     shapes = [s for s in SHAPES if s.category == category and _fits(s, size)]
     if not shapes:
@@ -377,7 +377,7 @@ def complete_body(
         measured: points in the object frame.
         size: (length, width, height) [m].
         category: class of the object.
-        body: of a vehicle, used instead of the generic one.
+        body: body of a vehicle, used instead of the generic one.
         spacing: distance between points of the body [m]; larger for large objects.
     """
     from scipy.spatial import cKDTree

@@ -69,7 +69,7 @@ def light_on(item: SceneObject, reconstruction: object) -> Float:
     """The slopes [3] in the frame of an object, at its pose in the middle of its time span.
 
     Args:
-        reconstruction: of the scene's provenance; without slopes, light comes from above.
+        reconstruction: entry of the scene's provenance; without slopes, light is from above.
     """
     known = reconstruction.get(LIGHT) if isinstance(reconstruction, dict) else None
     light = np.array(FROM_ABOVE if known is None else known, dtype=np.float64)

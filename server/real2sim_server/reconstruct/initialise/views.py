@@ -38,7 +38,7 @@ class PlacedSurfels:
     """All Gaussians of a scene under construction.
 
     Attributes:
-        surfels: in the frame of their instance.
+        surfels: surfels in the frames of their instances.
         instance: [N] uint16, 0 for the background, else 1 + index of the track; increasing.
     """
 

@@ -43,7 +43,7 @@ def ray_gradients(
     """Gradients of the cost of each ray with respect to its hits.
 
     Args:
-        begins, members, alpha, tau: of RayHits.
+        begins, members, alpha, tau: fields of RayHits.
         measured: [R] float64, range of each ray [m].
         directions: [bodies, R, 3] float32, unit, in the frame of each body.
         body_of: [N] int32, body of each Gaussian.
@@ -95,7 +95,7 @@ class SurfaceTable:
     """Flat Gaussians of all bodies; the last axis of each is its normal.
 
     Attributes:
-        object_ids: of the bodies after the background.
+        object_ids: ids of the bodies after the background.
         firsts: [bodies + 1] int64, first Gaussian of each body.
         means, quats, axes, scales: [N, 3], [N, 4], [N, 3, 3] and [N, 3] float32, initial values.
         logit, size, shift: [N] float32, learnt: logit of the opacity, logarithm of the factor of
@@ -187,7 +187,7 @@ class SweepHits:
 
     Attributes:
         hits: see :class:`RayHits`.
-        request: of the cast.
+        request: request of the cast.
         bodies: numbers of the bodies in the order of the request.
         of_request: [M] int32, the Gaussians numbered as in the request.
     """
@@ -248,8 +248,8 @@ class SeenSweep:
     """A sweep to learn from.
 
     Attributes:
-        frame: of the log.
-        rays: with a return.
+        frame: frame of the log.
+        rays: rays with a return.
         ring: [R] int32, of each ray; -1 for rays without a ring.
         elevations: [B] of the rings [rad]; [0] if the scan has no rings.
         missing: rays that were fired but did not return, if the scan has rings.

@@ -45,7 +45,7 @@ class FittedReflectivity:
 
     Attributes:
         incidence: see ``LidarSurfaces``.
-        response: of the rings; None if sweeps have no rings.
+        response: response of the rings; None if sweeps have no rings.
         known: share of the Gaussians that a ray hit.
         residual: root mean square of recorded minus explained intensities.
     """

@@ -238,12 +238,12 @@ def fit_lidar_surfaces(
     """Add Gaussians for LiDARs to a scene, fitted to ``log`` without its held-out frames.
 
     Args:
-        scene: made from ``log``.
-        log: with LiDAR sweeps.
+        scene: scene made from ``log``.
+        log: log with LiDAR sweeps.
         surfaces: fills the places that no beam measured: the result of ``initialise_scene`` on the
             same frames. Training saves it as ``initial.r2s`` in its folder. Built by default.
-        options: of the surfaces, see ``initialise_scene``; by default shapes alone.
-        steps: of learning; each takes about a second of one core.
+        options: options of ``surfaces``, see ``initialise_scene``; by default only shapes.
+        steps: number of learning steps; each takes about a second of one core.
         on_progress: called with the stage, completed and total steps.
 
     Raises:

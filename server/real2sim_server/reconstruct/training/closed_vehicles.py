@@ -68,7 +68,7 @@ def close_followed(
     """Project followed vehicles onto their bodies, in place.
 
     Args:
-        bodies: of the objects; None for objects without a body.
+        bodies: bodies of the objects; None for objects without a body.
 
     Returns:
         Whether each object was projected.
@@ -91,7 +91,7 @@ def offer_bodies(
     Args:
         followed: per object, whether only its outline determines its width; such bodies are offered
             in several INSETS.
-        bodies: of the objects; None for objects without a body.
+        bodies: bodies of the objects; None for objects without a body.
     """
     scene = model.scene
     reconstruction = scene.provenance.get("reconstruction")
@@ -124,7 +124,7 @@ def body_cloud(
     Flat regions of a single part get fewer, larger Gaussians.
 
     Args:
-        item: of stage 0.
+        item: object of stage 0.
         light: slopes [3] in its frame, see :func:`.vehicle_parts.fit_light`.
         palette: colours [10, 3] of parts, see :func:`.vehicle_parts.fit_palette`.
     """

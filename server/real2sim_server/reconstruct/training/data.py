@@ -48,7 +48,7 @@ class TrainingView:
     """One training image.
 
     Attributes:
-        camera: at the size of ``image``.
+        camera: camera at the size of ``image``.
         frame: index in the log.
         t_us: time of the image [us].
         image: [H, W, 3] float32 in [0, 1].
@@ -85,10 +85,10 @@ class TrainingViews:
     Decoded images are cached up to ``options.image_bytes``; the least recently used are evicted.
 
     Args:
-        log: with cameras.
+        log: log with cameras.
         frames: indices into ``log``.
         options: training options.
-        device: of the returned views. A device other than the CPU caches the views as bytes, also
+        device: device of the returned views. Other devices than the CPU cache views as bytes, also
             up to ``options.image_bytes``, so that later epochs copy nothing.
 
     Raises:

@@ -209,7 +209,7 @@ def relocate(
     Args:
         dead: [N] bool.
         count: number of Gaussians afterwards; at least the number of live ones.
-        min_opacity: of copies.
+        min_opacity: minimum opacity of copies.
         rng: samples the Gaussians to copy.
     """
     live = (~dead).nonzero()[:, 0]
@@ -272,7 +272,7 @@ def inject_noise(
 
     Args:
         rate: learning rate of the means [m].
-        strength: of the noise, relative to the rate.
+        strength: strength of the noise, relative to the rate.
         min_opacity: opacity around which the noise fades out.
     """
     drawn = rng.standard_normal((len(gaussians), 3), dtype=np.float32)
@@ -358,13 +358,13 @@ class DensifyOptions:
         min_opacity: Gaussians below it are removed, or moved by ``mcmc``.
         max_scale: larger ones near the drive are removed [m].
         reset_every: iterations between resets of opacity; 0 for never.
-        noise: of ``mcmc``: factor on the learning rate of means.
-        growth: of ``mcmc``: relative growth of the number per round.
+        noise: for ``mcmc``, factor on the learning rate of means.
+        growth: for ``mcmc``, relative growth of the number per round.
         hidden_rounds: fractions of all iterations at which hidden Gaussians are pruned.
         prior_round: fraction of all iterations at which they are pruned again and replaced by
             priors of stage 0; the surfaces in front close up in the remaining iterations.
-        background_limits: of hidden Gaussians in the background.
-        object_limits: of hidden Gaussians in objects.
+        background_limits: limits of hidden Gaussians in the background.
+        object_limits: limits of hidden Gaussians in objects.
         last_background_limits: additional limits in the prior round, for background no higher than
             the objects: Gaussians metres behind the visible surfaces were learnt through gaps in
             them, and become visible when an object is deleted.
@@ -429,7 +429,7 @@ class TrainingStep:
 
     Attributes:
         iteration: counted from 0.
-        rows: of the Gaussians of each rendered instance.
+        rows: rows of the Gaussians of each rendered instance.
         screen: their positions on the image, with gradients.
         means_rate: learning rate of the means in this step [m].
     """
@@ -449,8 +449,8 @@ class Strategy:
     Args:
         options: see :class:`DensifyOptions`.
         half_sizes: [I, 3] half the sizes of the objects' boxes [m], on the Gaussians' device.
-        seed: of all noise, together with the iteration.
-        iterations: of the whole training.
+        seed: seed of all noise, together with the iteration.
+        iterations: iterations of the whole training.
     """
 
     def __init__(

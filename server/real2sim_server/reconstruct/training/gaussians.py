@@ -237,7 +237,7 @@ class Gaussians:
         Their quaternions are not normalised: every renderer normalises them.
 
         Args:
-            degree: of the spherical harmonics.
+            degree: degree of the spherical harmonics.
             tones: [M, F] basis values, weights of each object's Fourier part; None for none.
             mirrored: objects to reflect at their x z plane.
         """
@@ -304,10 +304,10 @@ def from_scene(
     """Raw parameters of a scene.
 
     Args:
-        sh_degree: of the spherical harmonics.
+        sh_degree: degree of the spherical harmonics.
         harmonics: F, number of basis functions of time-varying colours.
         initial_opacity: upper bound, so that all opacities can still learn.
-        device: of the parameters.
+        device: device of the parameters.
     """
     clouds = [scene.background, *(o.cloud for o in scene.objects.values())]
     clouds = [c.with_sh_degree(sh_degree) for c in clouds]

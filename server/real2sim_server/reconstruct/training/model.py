@@ -40,7 +40,7 @@ class ImageGains:
     Args:
         cameras: number of cameras.
         times_us: [K] int64 times of training images, increasing.
-        device: of the gains.
+        device: device of the gains.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class KeyPoses:
     Attributes:
         times_us: [T] int64 key times [us].
         positions, quaternions: [T, 3] and [T, 4] float64 of the input boxes.
-        first_row: of this object in the packed corrections.
+        first_row: first row of this object in the packed corrections.
     """
 
     times_us: NDArray[np.int64]
@@ -115,7 +115,7 @@ class ObjectPoses:
         key_times_us: [K] times of training frames. Images correct a pose only at these times;
             other times between the first and last pose of a track are interpolated from their
             neighbours. None keeps every pose of the trajectories.
-        device: of corrections and poses.
+        device: device of corrections and poses.
     """
 
     def __init__(
@@ -256,15 +256,15 @@ class SceneModel:
     """Trainable parameters of a scene.
 
     Attributes:
-        device: of the parameters and the renderer, so that no step moves them.
+        device: device of the parameters and the renderer, so that no step moves them.
         mirrored: per object, whether training sometimes shows its mirrored side.
         priors: Gaussians that are rendered but not trained, or None.
 
     Args:
-        scene: of stage 0; its cameras, ego path, boxes and times do not change.
+        scene: scene of stage 0; its cameras, ego path, boxes and times do not change.
         options: training options.
         key_times_us: [K] int64, times of training images, at which boxes can be refined.
-        backend: of the renderer.
+        backend: backend of the renderer.
     """
 
     def __init__(
@@ -341,7 +341,7 @@ class SceneModel:
         """Render ``camera``, of the rig at any size, on the recording vehicle at ``t_us``.
 
         Args:
-            degree: of the spherical harmonics; the highest by default.
+            degree: degree of the spherical harmonics; the highest by default.
             mirrored: per object, whether to show its mirrored side.
             depth: whether to render depth.
         """

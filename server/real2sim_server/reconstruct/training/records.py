@@ -42,9 +42,9 @@ class Checkpoint:
         iteration: completed steps.
         counts: Gaussians of the background and of each object.
         prior_counts: the same for priors; empty before they are inserted.
-        optimizer_steps: of the optimiser.
-        options: of training, JSON values.
-        log_name: of the training log.
+        optimizer_steps: steps of the optimiser.
+        options: options of training, JSON values.
+        log_name: name of the training log.
         running: smoothed figures for progress.
         tensors: parameters and moments by name.
     """

@@ -245,11 +245,11 @@ def train(
     Neither stage 0 nor training reads images or sweeps of the held-out frames.
 
     Args:
-        options: of stage 0 and of training.
-        folder: for the first scene, checkpoints, metrics and preview pictures.
+        options: options of stage 0 and of training.
+        folder: folder of the first scene, checkpoints, metrics and preview pictures.
         resume: continue from the checkpoint in ``folder``. On the CPU the result is bit for bit
             the same as without an interruption.
-        backend: of the renderer.
+        backend: backend of the renderer.
         on_progress: called with the stage, completed and total steps.
         on_training: called with figures every ``options.log_every`` steps.
         timing_s: filled with the seconds of each stage.

@@ -55,10 +55,10 @@ class Trainer:
 
     Args:
         log: the drive, all frames.
-        scene: of stage 0, built without the held-out frames.
-        options: of training.
-        folder: for checkpoints and metrics; None writes nothing.
-        backend: of the renderer.
+        scene: scene of stage 0, built without the held-out frames.
+        options: options of training.
+        folder: folder of checkpoints and metrics; None writes nothing.
+        backend: backend of the renderer.
     """
 
     def __init__(
@@ -325,7 +325,7 @@ class Trainer:
         """Restore the last checkpoint in the folder.
 
         Raises:
-            ReconstructError: there is none, or it belongs to another log or other options.
+            ReconstructError: the checkpoint is missing, or belongs to another log or other options.
         """
         if self.folder is None:
             raise ReconstructError("a run without a folder leaves no checkpoint to resume")

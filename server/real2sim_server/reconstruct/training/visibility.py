@@ -267,7 +267,7 @@ class OfferedPriors:
     """Priors that can fill places that no image shows.
 
     Attributes:
-        scene: from stage 0, or with other clouds for its objects.
+        scene: scene of stage 0, or with other clouds for its objects.
         alternatives: [N] int64 per Gaussian of ``scene``: of the Gaussians with the same number,
             only the first that fits is inserted. A negative number marks a Gaussian without
             alternatives. None: no Gaussian has alternatives.
@@ -301,7 +301,7 @@ def occluded_priors(
         viewpoints: training views.
         limit: a background Gaussian counts as hidden in stage 0 up to this visible fraction.
         wanted: [N] bool, Gaussians of ``first`` to insert even where they are visible.
-        alternatives: of the Gaussians of ``first``, see :class:`OfferedPriors`.
+        alternatives: numbers of the Gaussians of ``first``, see :class:`OfferedPriors`.
         bare: [N] bool, Gaussians of ``first`` that count as hidden in stage 0.
     """
     hidden = visibility(first, viewpoints).fractions <= limit
@@ -361,7 +361,7 @@ class OcclusionPruning:
 
     Args:
         options: schedule of the rounds and limits for hidden Gaussians.
-        iterations: of the whole training.
+        iterations: iterations of the whole training.
         sample: returns the given number of random training views.
         unseen: returns the Gaussians of a model on sides that no view shows, see
             :func:`unseen_sides`; None: no such sides.
@@ -554,7 +554,7 @@ def unseen_sides(
     turns.
 
     Args:
-        bodies: of the objects; None where the body is unknown.
+        bodies: bodies of the objects; None where unknown.
     """
     normals, known = _body_normals(model, bodies)
     facing = viewing_directions(model, viewpoints, normals=normals, objects_only=True).facing

@@ -139,7 +139,7 @@ def load_scene(
 
     Args:
         path: folder of the bundle.
-        device: of the tensors.
+        device: device of the tensors.
         verify: check every hash and every value; without it only shapes, types and file
             sizes are checked.
 
@@ -555,8 +555,8 @@ class StagingLimits:
 
     Attributes:
         max_bytes: memory of the resulting Gaussians.
-        memory_bytes: of the process that reads, mapped files included.
-        seconds: of one import.
+        memory_bytes: memory of the reading process, including mapped files.
+        seconds: duration of one import.
     """
 
     max_bytes: int
@@ -586,11 +586,11 @@ def stage_asset(
 
     Args:
         source: the splat file.
-        folder: of the bundle; its parent exists.
+        folder: folder of the bundle; its parent exists.
         asset_id: name of the asset.
         options: ``category``, ``up_axis`` and ``yaw`` as for :func:`~.splats.import_splats`, and
             ``length`` [m], None for the length in the file.
-        limits: of the import.
+        limits: limits of the import.
 
     Raises:
         BundleTooLargeError, BundleError, SceneError: as :func:`stage_scene`.
@@ -652,7 +652,7 @@ def read_and_save_asset(
         name=asset_id,
         as_asset=True,
         category=category,
-        # Most files without axes come from trainers that look along z.
+        # Most files without axes come from trainers with cameras that look along z.
         up_axis=up_axis or up_axis_of(source) or "-y",
         yaw=yaw,
         max_bytes=max_bytes,

@@ -347,7 +347,7 @@ def lane_document(graph: LaneGraph, *, with_roads: bool = True) -> SceneLanes:
     """The document of a graph.
 
     Args:
-        graph: of a scene.
+        graph: graph of a scene.
         with_roads: include the reference lines of roads.
     """
     tables = [name for name in _TABLES if with_roads or name != "roads"]

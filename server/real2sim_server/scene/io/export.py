@@ -356,7 +356,7 @@ def export_scene(
     with file, category, size and track of each. None of them contains the sky.
 
     Args:
-        scene: to write.
+        scene: scene to write.
         out: file to write, or folder for separate object files.
         format: ``gltf``, or the suffix of a splat format without its dot.
         t_us: time to bake [us]; objects that do not exist then are omitted.

@@ -75,7 +75,7 @@ def check_memory(path: Path, count: int, harmonics: int, max_bytes: int | None) 
     """Reject a file by its unpacked size, independent of its compressed size.
 
     Args:
-        path: for the message.
+        path: file name for the message.
         count, harmonics: number of Gaussians, and of spherical harmonics of each.
         max_bytes: memory limit; None for no limit.
 

@@ -284,7 +284,7 @@ class Spz:
     [-1, 0.992]. Harmonics of degree 4 are dropped when read; extensions are skipped.
 
     Args:
-        version: of the files to write: 3 (gzip, supported by most viewers) or 4 (zstd, smaller).
+        version: version of written files: 3 (gzip, supported by most viewers) or 4 (zstd, smaller).
         gzip_level: 1 (fast) to 9 (small), of version 3.
     """
 

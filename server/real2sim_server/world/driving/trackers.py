@@ -95,7 +95,7 @@ def lagging_gains(lag):
     root is w / lag^2 with w^3 = w^2 + lag^4.
 
     Args:
-        lag: in units of the regulator's scale.
+        lag: time constant in units of the regulator's scale.
 
     Returns:
         b and c; sqrt(2) and 0 without a lag.

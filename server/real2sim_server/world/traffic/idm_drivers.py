@@ -126,8 +126,8 @@ SETTLES = 2.0
 MIN_CHANGE_SPEED = 3.0
 """Minimum speed for lane changes [m/s]."""
 DECIDES_EVERY = 1.0
-"""Interval between lane change decisions [s]. Drivers decide at different phases, because two drivers
-that always decide at once would yield to each other forever."""
+"""Interval between lane change decisions [s]. Drivers decide at different phases, because two that
+always decide at once would yield to each other forever."""
 RENEWED = 200.0
 """Remaining length at which the lane chain is extended [m]."""
 
