@@ -358,7 +358,7 @@ def _like_most(image: NDArray[np.uint8], colours: NDArray[np.uint8]) -> NDArray[
 
 
 def _near(values: Float, colours: Float) -> NDArray[np.bool_]:
-    """Which of ``values`` [..., 3] are within some standard deviations of ``colours`` [N, 3]."""
+    """Mask [...] of ``values`` [..., 3] within a few standard deviations of ``colours`` [N, 3]."""
     spread = np.cov(colours.T, bias=True) + MIN_DEVIATION**2 * np.eye(3)
     off = values - colours.mean(0)
     return np.asarray(((off @ np.linalg.inv(spread)) * off).sum(-1) < ALIKE**2)

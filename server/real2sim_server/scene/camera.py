@@ -327,7 +327,7 @@ def moved(pose: Float, linear: Any, angular: Any, seconds: float) -> Float:
 
 
 def turned(vector: Float) -> Float:
-    """The rotation [3, 3] about ``vector`` [3] by its length [rad]."""
+    """The rotation matrix [3, 3] of a rotation vector [3] [rad]."""
     angle = float(np.linalg.norm(vector))
     if angle == 0:
         return np.eye(3)

@@ -122,7 +122,7 @@ def _spread_directions(count: int = 64) -> Float:
 
 SH_DEGREES = {1: 0, 4: 1, 9: 2, 16: 3}
 UNSEEN = 0.25
-"""Uncertainty where no training ray passed: about the absolute error of a guessed colour."""
+"""Uncertainty without training rays: roughly the absolute error of a guessed colour."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -189,7 +189,7 @@ class Figure:
         return body
 
     def styled(self, **style: float) -> Figure:
-        """The same person in another walking style; the same object for the same style.
+        """The same person in another walking style; this object if the style is equal.
 
         Args:
             style: fields of :class:`..body.gait.GaitStyle`; other fields do not change.
@@ -224,8 +224,8 @@ class Figure:
             raise SceneError(f"{what}: weights of a figure must be positive and sum to one")
 
     def check_cloud(self, cloud: GaussianCloud, what: str) -> None:
-        """Raise SceneError unless ``cloud`` can follow it: as many Gaussians, with one colour
-        each for all directions."""
+        """Raise SceneError unless ``cloud`` has the same number of Gaussians, and colours without
+        view dependence."""
         if len(cloud) != len(self):
             raise SceneError(f"{what}: a figure of {len(self)} rows for {len(cloud)} Gaussians")
         if cloud.sh_degree:
@@ -249,7 +249,7 @@ class Figure:
             return self._walk(trajectory).cloud(cloud, t_us)
 
     def striding(self, cloud: GaussianCloud, stride: Stride) -> GaussianCloud:
-        """``cloud`` walking straight on, for callers that move it themselves.
+        """``cloud`` walking straight ahead, for callers that move the object themselves.
 
         Args:
             cloud: cloud in the rest pose, frame of the object.
@@ -340,7 +340,7 @@ class Figure:
 
 
 def _joints_at(body: Body, gait: Gait, times: ArrayLike) -> tuple[Float, Float]:
-    """Rotations [T, J, 4] and places [T, J, 3] of joints at ``times`` [T] [s]."""
+    """Rotations [T, J, 4] and positions [T, J, 3] of joints at ``times`` [T] [s]."""
     transforms = joint_transforms(body, gait.pose(times))
     return matrix_to_quaternion(transforms[..., :3]), joint_positions(body, transforms)
 
@@ -366,8 +366,8 @@ class _Binding:
     weights: NDArray[np.float32]
 
     def posed(self, cloud: GaussianCloud, turns: Float, places: Float) -> GaussianCloud:
-        """``cloud`` with joints turned [J, 4] against the rest pose, at places [J, 3]."""
-        # Rest positions and places in the frame of the object.
+        """``cloud`` with joints rotated [J, 4] from the rest pose, at positions [J, 3]."""
+        # Rest and current positions in the frame of the object.
         down = np.array([0.0, 0.0, self.middle])
         rest = self.body.joints - down
         shifts = places - down - (quaternion_to_matrix(turns) @ rest[:, :, None])[..., 0]

@@ -52,13 +52,13 @@ def height_under(heights: Any, frame: Any, x: float, y: float) -> Any:
 
 @kernel
 def height_at(heights: Any, frame: Any, x: float, y: float) -> Any:
-    """Ground height [m] below one place."""
+    """Ground height [m] below one position."""
     return height_under(heights, frame, x, y)
 
 
 @kernel
 def heights_at(heights: Any, frame: Any, points: Any) -> Any:
-    """Ground heights [S] float64 [m] below places [S, 2]."""
+    """Ground heights [S] float64 [m] below positions [S, 2]."""
     found = np.empty(len(points))
     for k in range(len(points)):
         found[k] = height_under(heights, frame, points[k, 0], points[k, 1])
@@ -85,7 +85,7 @@ def normal_over(heights: Any, frame: Any, x: float, y: float, yaw: float) -> Any
 
 @kernel
 def normals_at(heights: Any, frame: Any, points: Any) -> Any:
-    """Unit normals [S, 3] float64 of the ground below places [S, 2]."""
+    """Unit normals [S, 3] float64 of the ground below positions [S, 2]."""
     found = np.empty((len(points), 3))
     for k in range(len(points)):
         found[k] = normal_over(heights, frame, points[k, 0], points[k, 1], 0.0)

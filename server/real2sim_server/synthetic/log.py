@@ -179,7 +179,7 @@ class SyntheticLog(DrivingLog):
 
 @dataclass(frozen=True, eq=False)
 class SyntheticSource:
-    """Casts the rays of a synthetic drive.
+    """Ray caster of a synthetic drive.
 
     Attributes:
         config: configuration of the drive.

@@ -15,7 +15,7 @@ import numpy as np
 
 from .._numba import func
 
-# Hash noise for textures, faded where it is finer than a pixel.
+# Hash noise for textures, faded out below the size of a pixel.
 
 _MASK = 0xFFFFFFFF
 _RNG = np.random.default_rng(20240229)

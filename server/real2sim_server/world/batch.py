@@ -104,7 +104,7 @@ Longs = NDArray[np.int64]
 
 
 class Tracks(NamedTuple):
-    """Objects of the scenario, N of them.
+    """The N objects of the scenario.
 
     Attributes:
         ends, times, knots: trajectories, see ``edit.track_kernels.poses_at``.

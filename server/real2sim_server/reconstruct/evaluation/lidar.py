@@ -355,7 +355,7 @@ def _against_street(
 
 
 def _returned(lidar: Lidar, azimuth: Float, elevation: Float) -> NDArray[np.bool_]:
-    """Which rays of a grid are among recorded ones: nearest row and column."""
+    """Mask of the rays of a grid that were recorded, by nearest row and column."""
     beams = lidar.beams
     rows = np.argsort(beams.elevation[:, 0])
     heights = beams.elevation[rows, 0]

@@ -138,7 +138,7 @@ def within_an_object(log: DrivingLog, position: Float, t_us: int) -> bool:
 def _depth_errors(
     depth: NDArray[np.float32], true_depth: NDArray[np.float32]
 ) -> NDArray[np.float64]:
-    """At every DEPTH_STRIDE-th pixel that shows something; infinite where nothing is rendered."""
+    """Depth errors at every DEPTH_STRIDE-th pixel with a surface; infinite if none is rendered."""
     rendered = depth[::DEPTH_STRIDE, ::DEPTH_STRIDE].astype(np.float64)
     expected = true_depth[::DEPTH_STRIDE, ::DEPTH_STRIDE].astype(np.float64)
     errors = np.where(rendered > 0, np.abs(rendered - expected), np.inf)

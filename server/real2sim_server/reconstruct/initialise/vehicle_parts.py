@@ -197,7 +197,7 @@ def palette_of(reconstruction: object) -> Colours:
 
 
 def wheel_parts(uv: Float) -> NDArray[np.uint8]:
-    """Tyre, rim, or the dark between a rim's spokes, at places [N, 2] relative to the radius."""
+    """Tyre, rim, or the gap between spokes, at positions [N, 2] relative to the radius."""
     radius, angle = np.hypot(uv[:, 0], uv[:, 1]), np.arctan2(uv[:, 1], uv[:, 0])
     between = (radius > 0.22) & (radius < 0.6) & (np.cos(5 * angle) < -0.1)
     return np.where((radius < 0.68) & ~between, Part.RIM, Part.TYRE).astype(np.uint8)

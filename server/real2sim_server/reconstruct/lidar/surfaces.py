@@ -240,7 +240,7 @@ def fit_lidar_surfaces(
     Args:
         scene: scene made from ``log``.
         log: log with LiDAR sweeps.
-        surfaces: fills the places that no beam measured: the result of ``initialise_scene`` on the
+        surfaces: fills regions that no beam measured: the result of ``initialise_scene`` on the
             same frames. Training saves it as ``initial.r2s`` in its folder. Built by default.
         options: options of ``surfaces``, see ``initialise_scene``; by default only shapes.
         steps: number of learning steps; each takes about a second of one core.

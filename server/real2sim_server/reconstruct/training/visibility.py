@@ -264,7 +264,7 @@ def hardly_seen(model: SceneModel, seen: GaussianVisibility, offered: OfferedPri
 
 @dataclass(frozen=True, eq=False)
 class OfferedPriors:
-    """Priors that can fill places that no image shows.
+    """Priors for regions that no image shows.
 
     Attributes:
         scene: scene of stage 0, or with other clouds for its objects.
