@@ -1,4 +1,4 @@
-"""Push a parked car into its neighbour, and film what happens.
+"""Push a parked car into its neighbour and record a film of the crash.
 
 Needs a worker: ``real2sim serve --demo``. Writes ``crash.webm``.
 """

@@ -8,7 +8,7 @@ from real2sim.planners import FollowRoute, Idm, run_episode
 
 
 def main() -> None:
-    """Drive the corner case with both planners and print how they did."""
+    """Drive the corner case with both planners and print the results."""
     with real2sim.connect() as sim:
         scenario = sim.scenarios.create(scene="demo_street", name="cut-in")
         scenario.apply_corner_case("cut_in", gap=8.0)  # [m]

@@ -9,7 +9,7 @@ import real2sim
 
 
 def main() -> None:
-    """Edit, export, and print what the data set contains."""
+    """Edit, export, and print the contents of the data set."""
     with real2sim.connect() as sim:
         scenario = sim.scenarios.create(scene="demo_street", name="data set")
         scenario.objects["car_6"].duplicate(x=-9.0, frame="object")

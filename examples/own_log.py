@@ -1,6 +1,6 @@
 """Turn your own arrays into a log, check it, and reconstruct a scene from it.
 
-Runs without a worker; needs ``pip install 'real2sim[server]'``. Replace ``record`` by your data;
+Runs without a worker; needs ``pip install 'real2sim[server]'``. Replace ``record`` with your data.
 ``docs/log_format.md`` explains frames and times. Writes ``my_drive/`` and ``my_scene/``.
 """
 
@@ -37,11 +37,11 @@ class Recording:
     """A drive in memory; yours may read images and sweeps from files.
 
     Attributes:
-        times_us: [F] of the frames.
-        T_world_vehicle: [F, 4, 4], the rear axle's centre on the ground.
-        T_world_car: [F, 4, 4], the centre of the other car's box.
+        times_us: [F] times of the frames [us].
+        T_world_vehicle: [F, 4, 4] poses of the rear axle's centre on the ground.
+        T_world_car: [F, 4, 4] poses of the centre of the other car's box.
         images: [F, H, W, 3] uint8 RGB.
-        points: for each frame [N, 3] in the LiDAR's frame, already free of the vehicle's motion.
+        points: for each frame [N, 3] in the LiDAR frame, motion-compensated [m].
     """
 
     times_us: NDArray[np.int64]
@@ -51,11 +51,11 @@ class Recording:
     points: list[NDArray[np.float64]]
 
     def image(self, camera: str, frame: int) -> NDArray[np.uint8]:
-        """The image of a camera at a frame."""
+        """The image of a camera in a frame."""
         return self.images[frame]
 
     def lidar(self, frame: int) -> LidarSweep:
-        """The sweep of a frame, in the vehicle's frame."""
+        """The sweep of a frame, in the vehicle frame."""
         points = apply_transform(T_VEHICLE_LIDAR, self.points[frame])
         return LidarSweep(
             points=points.astype(np.float32),
@@ -85,7 +85,7 @@ def record() -> Recording:
 
 
 def main() -> None:
-    """Write the log, check it, reconstruct it without training."""
+    """Write the log, check it, and reconstruct it without training."""
     drive = record()
     path = Trajectory.from_transforms(drive.times_us, drive.T_world_car)
     log = DrivingLog(

@@ -24,7 +24,7 @@ class CameraPolicy:
 
     @torch.inference_mode()
     def plan(self, obs: Observation) -> Control:
-        """Steer by the image, keep 8 m/s."""
+        """Steer from the image and keep a speed of 8 m/s."""
         image = torch.from_numpy(obs.image("front") / 255.0).float().permute(2, 0, 1)[None]
         steering = 0.05 * float(self.net(image).tanh())  # [rad], positive to the left
         return Control(acceleration=8.0 - obs.ego.speed, steering=steering)

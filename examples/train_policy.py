@@ -12,7 +12,7 @@ WORLDS, ELITE, ROUNDS, STEPS = 64, 8, 6, 60
 
 
 def features(obs: dict[str, NDArray[np.float32]]) -> NDArray[np.float32]:
-    """Speed, bearings of a near and a far point of the route, and 1: [N, 4]."""
+    """[N, 4]: speed, bearings of a near and a far point of the route, and 1."""
     points = obs["route"][:, 3], obs["route"][:, 10]  # [N, 2], vehicle frame [m]
     angles = [point[:, 1] / np.maximum(point[:, 0], 1.0) for point in points]
     speed = obs["state"][:, 0] / 10.0
@@ -32,7 +32,7 @@ def evaluate(env: gymnasium.vector.VectorEnv, weights: NDArray[np.float64]) -> N
 
 
 def main() -> None:
-    """Train, and print the mean and the best return of each round."""
+    """Train, and print the mean and best return of each round."""
     name = "real2sim_server.learning:real2sim/DriveBatch-v0"
     env = gymnasium.make_vec(name, num_envs=WORLDS, options={"horizon": STEPS})
     rng = np.random.default_rng(0)

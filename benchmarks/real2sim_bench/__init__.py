@@ -1,1 +1,1 @@
-"""``real2sim bench``: benchmarks, relative to a reference or a peer measured in the same run."""
+"""``real2sim bench``: benchmarks relative to a reference or another framework in the same run."""

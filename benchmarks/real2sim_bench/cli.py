@@ -23,7 +23,7 @@ LIBRARIES = ("real2sim", "numpy", "torch", "numba", "llvmlite")
 
 
 class SoakFailedError(RuntimeError):
-    """The worker violated the protocol, or its memory grew."""
+    """Error: the worker violated the protocol, or its memory grew."""
 
 
 @command("render", group=app)

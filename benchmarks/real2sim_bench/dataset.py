@@ -1,8 +1,9 @@
 """``real2sim bench dataset``: cost of a labelled frame relative to its colour image.
 
-CPU times are those of all threads of this process, which other load affects little. They are the
-minimum over several rounds of one frame of the demo street, with three cameras of 640x427. Frames
-per second are elapsed times of a complete export with a 64-beam LiDAR, and depend on other load.
+CPU times cover all threads of this process and hardly depend on other load. They are the minimum
+over several rounds of one frame of the demo street, with three cameras of 640x427. Frames per
+second are measured in elapsed time on a complete export with a 64-beam LiDAR, and depend on other
+load.
 """
 
 from __future__ import annotations

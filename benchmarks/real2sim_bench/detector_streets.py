@@ -46,8 +46,8 @@ MIN_PIXELS, MIN_SIDE = 40, 6.0
 """Minimum visible pixels and box side of an object that counts, in pixels of the final image."""
 FORMATS = ("coco", "labels")
 FINER = 2
-"""Supersampling factor. Images are drawn finer and averaged, so pixels integrate like a camera's,
-and boxes have subpixel edges."""
+"""Supersampling factor. Images are rendered finer and averaged, so that pixels integrate light like
+those of a camera, and boxes have subpixel edges."""
 
 
 @dataclass(frozen=True)
@@ -229,8 +229,8 @@ def withheld_drive(
 
 
 def boxes_in(instance: NDArray[np.uint16]) -> TrueBoxes:
-    """Boxes [px of the final image] of the objects in a supersampled instance image, and which
-    count."""
+    """Boxes of the objects in a supersampled instance image [px of the final image], and a mask of
+    those that count."""
     boxes, counts = [], []
     for number in np.unique(instance).tolist():
         mask = without_blobs(instance == number)

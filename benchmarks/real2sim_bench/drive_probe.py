@@ -73,7 +73,7 @@ class LeanSocket:
     def close(self) -> None:
         """Close the connection without waiting for the server's close frame."""
         self._protocol.send_close(1000)
-        with contextlib.suppress(OSError):  # The server may have closed first.
+        with contextlib.suppress(OSError):  # The server may have closed the connection first.
             self._flush()
         self.socket.close()
 
@@ -313,5 +313,5 @@ def action(obs: Mapping[str, Any]) -> dict[str, Any]:
 
 def straight_on(t_us: int) -> dict[str, Any]:
     """A trajectory plan over the next two seconds."""
-    poses = [list(pose) for pose in POSES]  # A copy: some planners change it.
+    poses = [list(pose) for pose in POSES]  # Some planners modify the plan, so return a copy.
     return {"kind": "trajectory", "times_us": [t_us + us for us in AHEAD_US], "poses": poses}

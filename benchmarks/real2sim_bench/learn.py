@@ -123,7 +123,7 @@ def echo_app(observation: bytes) -> ASGIApp:
     answers = dict(zip(ECHOED, (lambda _action: observation, read_and_packed), strict=True))
 
     async def app(scope: Scope, receive: Receive, send: Send) -> None:
-        # A disconnecting client is not an error.
+        # A client that disconnects is not an error.
         with contextlib.suppress(WebSocketDisconnect):
             await _echo(WebSocket(scope, receive, send), answers[scope["path"].strip("/")])
 
@@ -146,7 +146,7 @@ async def _echo(socket: WebSocket, answer: Answer) -> None:
 Figures = dict[str, Any]
 
 Drive = Callable[[int], None]
-"""Makes at least the given total number of steps."""
+"""Runs at least the given total number of steps."""
 Driving = Callable[[str, int], AbstractContextManager[Drive]]
 """Connects a number of planners to the server at a URL."""
 

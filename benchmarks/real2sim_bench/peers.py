@@ -1,4 +1,4 @@
-"""The same physics in other frameworks: their interface, and which are installed."""
+"""The same physics in other frameworks: a common interface, and availability."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class PeerBlock:
     """Fixed corotated particles on a dense grid, single precision, sorted by cell.
 
     Attributes:
-        positions, velocities: [N, 3] [m], [m/s]; all stay inside the grid.
+        positions, velocities: [N, 3] [m], [m/s]; particles stay inside the grid.
         mass, volume: mass [kg] and volume [m^3] of a particle.
         mu, lam: Lame parameters [Pa].
         dx, dt: cell size [m] and substep [s].

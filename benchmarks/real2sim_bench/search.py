@@ -30,7 +30,7 @@ CASES: Mapping[str, str] = {
     "pid": "cut_in_calm",
     "learned": "cut_in_brief",
 }
-"""Test space of each planner; it fails there once in hundreds of episodes."""
+"""Test space of each planner, in which it fails about once in hundreds of episodes."""
 LEARNED = "learned"
 ALL_SPACES = ("cut_in", "hard_brake", "junction_crossing", "oncoming", "slow_crossing")
 
@@ -42,7 +42,7 @@ class SearchBenchOptions:
     Attributes:
         episodes: maximum episodes per search.
         seeds: number of seeds per planner.
-        first_seed: first seed; the spaces were chosen with seeds from 1000.
+        first_seed: first seed. The spaces were chosen with seeds from 1000 on.
         policy: weights of the learned planner from `train-policy`; None skips it.
         planners: names of planners.
         whole: complete searches per planner over all spaces, for the kinds of failures.

@@ -304,7 +304,7 @@ def _measure(console: Console, options: ServeBenchOptions, *, url: str, pid: int
             info = client.wait_ready()
         setup = {"device": info.device.model_dump(), "cores": os.cpu_count(), **vars(options)}
         figures: Figures = {"setup": setup}
-        # First, before the worker has freed memory that it could reuse.
+        # Measure memory first, before the worker has free memory to reuse.
         with console.status(f"memory of {SESSIONS} sessions"):
             figures["memory"] = _memory(client, raw, pid)
         with console.status("drive steps without sensors"):

@@ -1,4 +1,4 @@
-"""MLS-MPM in Taichi, after its own mpm3d example, with a Newton polar decomposition."""
+"""MLS-MPM in Taichi, after Taichi's mpm3d example, with a Newton polar decomposition."""
 
 from __future__ import annotations
 

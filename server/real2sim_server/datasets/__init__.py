@@ -6,5 +6,5 @@
 - ``writers``: one module per format, behind one Protocol;
 - ``export``: the complete export, from a drive to a folder.
 
-The manifest of an export describes how each label was made, see :data:`~.labels.HOW`.
+The manifest of an export describes the source of each label, see :data:`~.labels.HOW`.
 """

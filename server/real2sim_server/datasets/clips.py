@@ -70,25 +70,25 @@ POINT = np.dtype(
 """A row of ``points``: ego frame [m], [m/s]."""
 
 SEED_STEP = 1_000_003
-"""Distance between the seeds of exports; frames add their time step."""
+"""Distance between the seeds of exports. Frames add their time step."""
 
 NO_VALUES: Mapping[str, Any] = MappingProxyType({})
 ENCODERS = 2
-"""Threads that encode."""
+"""Number of encoding threads."""
 
 FLOW_SCALE, FLOW_ZERO = 64.0, 1 << 15
 
 
 @runtime_checkable
 class CastsToo(Protocol):
-    """A backend that follows beams itself, where whoever draws must."""
+    """A backend that also casts beams."""
 
     caster: CastBackend
 
 
 @dataclass(frozen=True, eq=False)
 class LabelledMoment:
-    """A moment with everything that is known of it."""
+    """All labels of a moment."""
 
     moment: Moment
     boxes: Sequence[ObjectBox]
@@ -100,11 +100,11 @@ class Clip:
     """A clip in the store.
 
     Attributes:
-        folder: of its files.
+        folder: folder with the files.
         name: four digits.
-        split: that it belongs to.
+        split: name of its split.
         frames: labels of each frame, see ``docs/datasets.md``.
-        values: of the parameters of a sweep.
+        values: parameter values of a sweep.
     """
 
     folder: Path
@@ -115,13 +115,13 @@ class Clip:
 
     @classmethod
     def open(cls, folder: Path) -> Clip:
-        """The clip in a folder that :func:`write_clip` has made."""
+        """The clip in a folder written by :func:`write_clip`."""
         content = json.loads((folder / "labels.json").read_bytes())
         values = content.get("values", {})
         return cls(folder, content["name"], content["split"], content["frames"], values)
 
     def file(self, kind: str, camera: str, frame: int) -> Path:
-        """The png of an image of that kind; the first and the last frame each lack one flow."""
+        """The png of an image of that kind. The first and the last frame each lack one flow."""
         return self.folder / kind / camera / f"{frame:06d}.png"
 
     def pixels(self, kind: str, camera: str, frame: int) -> NDArray[Any]:
@@ -132,7 +132,7 @@ class Clip:
         return np.ascontiguousarray(image[..., ::-1]) if kind == "rgb" else np.asarray(image)
 
     def points(self, frame: int) -> NDArray[Any]:
-        """Rows of POINT."""
+        """Points as rows of POINT."""
         rows: NDArray[Any] = np.load(self.folder / "points" / f"{frame:06d}.npy")
         return rows
 
@@ -387,7 +387,7 @@ def flow_png(flow: NDArray[np.float32], valid: NDArray[np.bool_]) -> bytes:
     levels = np.rint(flow * FLOW_SCALE) + FLOW_ZERO
     good = valid & ((levels >= 1) & (levels <= np.iinfo(np.uint16).max)).all(axis=-1)
     stored = np.zeros((*valid.shape, 3), np.uint16)
-    # OpenCV writes channels from the last to the first.
+    # OpenCV writes channels in reverse order.
     stored[..., 2] = np.where(good, levels[..., 0], 0)
     stored[..., 1] = np.where(good, levels[..., 1], 0)
     stored[..., 0] = good
@@ -406,7 +406,7 @@ def _png(mask: NDArray[np.bool_]) -> bytes:
 
 
 def _encoded(image: NDArray[Any]) -> bytes:
-    # Flow is smooth along rows: one filter for all of them takes half the time, and less room.
+    # Flow is smooth along rows: a single filter halves the time and gives smaller files.
     along_rows = [cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB]
     done, data = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1, *along_rows])
     assert done
@@ -414,12 +414,11 @@ def _encoded(image: NDArray[Any]) -> bytes:
 
 
 # --- Makers ---------------------------------------------------------------------------------------
-
-# Clips are made by local processes or a Ray cluster. Their bytes do not depend on the maker; a clip
+# Local processes or a Ray cluster make the clips. The bytes do not depend on the maker, and a clip
 # is made again if its maker dies. Clips return as archives, so no shared disk is needed.
 
 Recipe = Callable[[], Sequence[Variant]]
-"""Makes the variants of an export; can be pickled, and every worker finds its files."""
+"""Makes the variants of an export. Must be picklable, with files available to every worker."""
 
 
 @dataclass(frozen=True)
@@ -428,7 +427,7 @@ class ClipMakers:
 
     Attributes:
         executor: runs the workers.
-        recipe: makes the variants in each of them.
+        recipe: makes the variants in each worker.
         backend: name of the renderer's backend.
     """
 
@@ -443,10 +442,10 @@ class ClipMakers:
         folder: Path,
         on_frames: Callable[[int], None],
     ) -> None:
-        """Make each clip as a folder of its name below ``folder``, created atomically.
+        """Make each clip as a folder below ``folder``, created atomically and named after the clip.
 
         Args:
-            plan: of the export.
+            plan: plan of the export.
             clips: missing clips.
             folder: parent of the clips.
             on_frames: called with the number of frames of each finished clip.

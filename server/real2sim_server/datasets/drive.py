@@ -1,4 +1,4 @@
-"""The exported drive, which can be viewed at any of its times."""
+"""The exported drive, as states over time."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ class Moment:
 
     Attributes:
         t_us: time [us].
-        instances: to render.
+        instances: instances to render.
         placed: all present objects.
         T_world_ego: [4, 4] pose of the ego (rear axle centre on the ground).
-        strides: of people without a trajectory, by object id.
+        strides: walking states of people without a trajectory, by object id.
     """
 
     t_us: int
@@ -63,7 +63,7 @@ class Drive(Protocol):
 
     @property
     def scene(self) -> Scene:
-        """Gives cameras, sky and ground."""
+        """The scene with cameras, sky and ground."""
         ...
 
     @property
@@ -129,10 +129,10 @@ class ScenarioDrive:
 
 @dataclass(frozen=True, eq=False)
 class EpisodeDrive:
-    """A recorded episode; its times are those of its steps.
+    """A recorded episode. Its times are those of its steps.
 
     Attributes:
-        scene: of the episode.
+        scene: scene of the episode.
         worlds: after each step, by time.
     """
 
@@ -146,7 +146,7 @@ class EpisodeDrive:
         """The episode, replayed.
 
         Raises:
-            DatasetError: it ran on another scene, or holds no step.
+            DatasetError: it ran on another scene, or has no steps.
             EditError, RecordingError: as :meth:`Recording.replayer`.
         """
         if recording.scene_hash != scene.content_hash:
@@ -183,7 +183,7 @@ class EpisodeDrive:
         return math.hypot(*self._world(t_us).motion.velocity)
 
     def _world(self, t_us: int) -> World:
-        """The one of the last step up to ``t_us``."""
+        """The world after the last step up to ``t_us``."""
         return self.worlds[self._place(t_us)]
 
     def _place(self, t_us: int) -> int:
@@ -208,7 +208,7 @@ class EpisodeDrive:
 
 
 def _way(worlds: Sequence[World], object_id: str) -> Trajectory:
-    """Trajectory of an object over a few steps, while it exists."""
+    """Trajectory of an object over those of a few steps at which it exists."""
     rows = []
     for world in worlds:
         for subject, transform in zip(world.agents.objects, world.agents.transforms, strict=True):

@@ -28,7 +28,7 @@ from .writers.plain import labels_sheet
 
 # --- Previews ------------------------------------------------------------------------------------
 
-# Some sheets of labels over pictures, to look at first.
+# Sheets of labels over pictures for a first inspection.
 
 MAX_PREVIEWS = 6
 QUALITY = 85
@@ -104,17 +104,17 @@ FORMAT = "real2sim-dataset"
 VERSION = 1
 LICENCE, MANIFEST, PREVIEW = "LICENSE.txt", "manifest.json", "preview"
 OUTPUT_SHARE = 0.7
-"""Bytes of one written format against those of the labels it is made of, about."""
+"""Approximate size of one written format relative to its labels."""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Estimated cost of an export, from frames labelled on this machine now.
+    """Estimated cost of an export, measured on a few frames on this machine.
 
     Attributes:
-        frames, images: number of them.
-        nbytes: of the folder while it is made, about.
-        minutes: about.
+        frames, images: numbers of frames and images.
+        nbytes: approximate size of the folder during the export [bytes].
+        minutes: approximate duration [min].
     """
 
     frames: int
@@ -174,10 +174,10 @@ def export_dataset(
     """Label a drive and write it to the new folder ``out``, which is created atomically.
 
     If an export is interrupted, its finished clips are kept next to ``out``. The same call then
-    continues after the last complete clip, and gives the same bytes.
+    continues after the last complete clip, with the same result.
 
     Args:
-        drive: to export; or the variants of a sweep, all of one scene.
+        drive: drive to export, or the variants of a sweep, all of one scene.
         plan: export options.
         out: a folder that does not exist yet.
         made_of: further inputs of the drive (operations, episode ...), for the manifest; JSON

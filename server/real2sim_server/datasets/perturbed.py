@@ -3,8 +3,8 @@
 The ego of a clip starts with a lateral and a heading offset, and a plan brings it back: the offset
 from the path is a fifth-order polynomial in the driven distance, with the slope of the heading
 offset at the start and slope zero at the end. Cameras and LiDAR are rendered from the perturbed
-poses, and the ego's future is the plan. After SimScale (arXiv 2511.23369), whose pseudo-expert also
-plans back.
+poses, and the ego's future is the plan. Similar to the pseudo-expert of SimScale (arXiv
+2511.23369).
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ STEP_US = 50_000
 MIN_PATH_LENGTH = 8.0
 """Minimum length of the recovery [m]."""
 TRIES = 20
-"""Maximum number of samples to find a start clear of all objects; each is smaller than the
-previous.
+"""Maximum number of samples for a start clear of all objects. Each offset is smaller than the
+previous one.
 """
 SMALLER = 0.85
 LIMIT = 2.5
@@ -41,7 +41,7 @@ class Perturbation:
 
     Attributes:
         lateral_sigma: standard deviation of the lateral offset [m].
-        heading_sigma: of the heading relative to the path [rad].
+        heading_sigma: standard deviation of the heading relative to the path [rad].
         recover_s: recovery time at the initial speed [s].
         copies: number of perturbed copies of each clip, with different starts.
     """
@@ -80,7 +80,7 @@ class PerturbedDrive:
         places = np.array([base.ego_at(int(t))[:2, 3] for t in times])
         steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
         way = np.concatenate([[0.0], np.cumsum(steps)])
-        # Speed over the first half second, whatever the steps of an episode are.
+        # Speed over the first half second, independent of the time step of an episode.
         first = min(10, len(way) - 1)
         speed = way[first] / max(first * STEP_US * 1e-6, 1e-6)
         length = max(MIN_PATH_LENGTH, speed * recover_s)
@@ -151,9 +151,9 @@ class PerturbedDrive:
 def perturbed(
     drive: Drive, perturbation: Perturbation, times_us: Sequence[int], seed: Sequence[int]
 ) -> PerturbedDrive:
-    """The drive of a clip from a start that ``seed`` draws, and that is clear of every object.
+    """The drive of a clip with a random start that is clear of all objects.
 
-    After TRIES draws that are not, it starts on its path.
+    After TRIES samples without success, the drive starts on its path.
     """
     rng = np.random.default_rng(list(seed))
     for k in range(TRIES):

@@ -29,7 +29,7 @@ from .perturbed import Perturbation
 
 # --- Rig -----------------------------------------------------------------------------------------
 
-# Sensors of a data set from a file: cameras of the scene or your own, and a LiDAR.
+# Sensors of a data set from a file: cameras of the scene, new cameras, and a LiDAR.
 
 Degrees = Annotated[float, Field(ge=-360, le=360)]
 
@@ -71,10 +71,10 @@ def read_rig(path: Path) -> dict[str, Any]:
 
 
 def cameras_of(values: Mapping[str, Any], rig: CameraRig) -> list[Camera]:
-    """The cameras that a rig file names, in its order.
+    """The cameras of a rig file, in order.
 
     Raises:
-        DatasetError: invalid values, an unknown camera, or a duplicate name.
+        DatasetError: the values are invalid, the scene lacks a camera, or a name is not unique.
     """
     try:
         asked = Rig.model_validate(values).cameras
@@ -123,7 +123,7 @@ def _turn(asked: RigCamera) -> Any:
 
 # --- Variants ------------------------------------------------------------------------------------
 
-# The same drive many times, each with other values in its edits.
+# The same drive several times, with different values in its edits.
 
 MAX_VARIANTS = 1000
 _OPERATIONS: TypeAdapter[list[Operation]] = TypeAdapter(list[Operation])
@@ -134,8 +134,8 @@ class Variant:
     """One drive of a sweep.
 
     Attributes:
-        drive: to export.
-        values: of the parameters; empty without a sweep.
+        drive: drive to export.
+        values: parameter values; empty without a sweep.
     """
 
     drive: Drive
@@ -147,10 +147,10 @@ def swept(scene: Scene, state: ScenarioState, sweep: DatasetSweep, seed: int) ->
     of the distributions.
 
     Args:
-        scene: of the scenario.
+        scene: scene of the scenario.
         state: before the edits of the sweep.
         sweep: parameters, and edits in which ``"$name"`` is replaced by a value.
-        seed: of the samples.
+        seed: seed of the samples.
 
     Raises:
         DatasetError: more than MAX_VARIANTS, an edit without a parameter, parameters without an
@@ -238,7 +238,7 @@ class ExportPlan:
     Attributes:
         formats: names of writers, see :func:`~.writers.writer_names`.
         cameras: names; empty for all.
-        width: of images [px]; None for the cameras' own.
+        width: image width [px]; None for the cameras' widths.
         period_us: between frames [us].
         start_us, end_us: first and last time [us]; None for those of the drive.
         clip_s: length of a clip [s], the unit of writing, resuming and splitting.
@@ -249,7 +249,7 @@ class ExportPlan:
             cameras' depth.
         rig: values of a rig file, instead of ``cameras``, ``width`` and ``lidar``.
         perturb: distribution of the starts of clips; None: on the path.
-        noise: of a detector, written as additional boxes; None: no such boxes.
+        noise: error model of a detector, whose boxes are written in addition; None for none.
     """
 
     formats: tuple[str, ...]
@@ -280,7 +280,7 @@ class PlannedClip:
     Attributes:
         name: four digits.
         split: name of its split.
-        times_us: of its frames [us].
+        times_us: times of its frames [us].
         variant: index of its drive in the sweep.
         copy: index of its perturbed start; None if it starts on the path.
     """
@@ -307,7 +307,7 @@ def planned_cameras(drive: Drive, plan: ExportPlan) -> list[Camera]:
 
 
 def planned_lidar(plan: ExportPlan) -> Lidar | None:
-    """The LiDAR of a plan, on the roof where it is not placed itself.
+    """The LiDAR of a plan, on the roof unless the values contain a pose.
 
     Raises:
         DatasetError: an unknown name, or invalid values.
@@ -326,7 +326,7 @@ def planned_lidar(plan: ExportPlan) -> Lidar | None:
 def planned_shards(variants: Sequence[Variant], plan: ExportPlan) -> list[PlannedClip]:
     """The clips of all drives, once per perturbation, with consecutive numbers.
 
-    All clips of one time section are in the same split, so test data is never trained on.
+    All clips of one time section are in the same split, which prevents training on test data.
 
     Raises:
         DatasetError: as :func:`planned_clips`, or too many frames in total.
@@ -345,11 +345,11 @@ def planned_shards(variants: Sequence[Variant], plan: ExportPlan) -> list[Planne
 
 
 def planned_clips(drive: Drive, plan: ExportPlan) -> list[PlannedClip]:
-    """All clips in their order.
+    """All clips in order.
 
     Raises:
-        DatasetError: for instants outside of the drive, a period or a length that give no frame,
-            too many frames, or shares that are none.
+        DatasetError: times outside the drive, a period or length without a frame, too many
+            frames, or invalid shares.
     """
     first, last = drive.span
     start = first if plan.start_us is None else plan.start_us

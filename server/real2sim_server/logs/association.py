@@ -41,7 +41,7 @@ class SweepGround:
     reach: float
 
     def at(self, places: Float) -> Float:
-        """Height of the ground [m] below places [..., >= 2], bilinear between cells."""
+        """Height of the ground [m] below positions [..., >= 2], bilinear between cells."""
         cells = (places[..., :2] + self.reach) / GROUND_CELL - 0.5
         rows, columns = cells[..., 0].ravel(), cells[..., 1].ravel()
         found = ndimage.map_coordinates(self.heights, [rows, columns], order=1, mode="nearest")
@@ -121,9 +121,9 @@ def find_clusters(
 ) -> list[LidarCluster]:
     """Objects on the ground within ``reach`` [m] of the vehicle.
 
-    Points in the same or in adjacent cells of a grid seen from above form a cluster. Clusters are
-    dropped if they are too long, have too few points, or are too flat or too far above the ground
-    for a vehicle or person.
+    Points in the same or adjacent cells of a horizontal grid form a cluster. Clusters are dropped
+    if they are too long, have too few points, or are too flat or too far above the ground for a
+    vehicle or person.
     """
     points = sweep.points.astype(np.float64)
     near = (np.abs(points[:, :2]) < reach).all(axis=1) & ~_on_ego(points, ego_size)
@@ -354,7 +354,7 @@ class Track:
 def associate(
     scans: Sequence[Sequence[LidarCluster]], times: Float, *, max_missed: int
 ) -> list[Track]:
-    """Tracks through all frames; one ends after ``max_missed`` frames without a cluster."""
+    """Tracks through all frames. A track ends after ``max_missed`` frames without a cluster."""
     alive: list[Track] = []
     ended: list[Track] = []
     for frame, scan in enumerate(scans):

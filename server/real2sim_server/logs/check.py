@@ -56,7 +56,7 @@ class LogCheck:
         return (*self.table_problems, *self.image_problems, *self.sweep_problems)
 
     def as_json(self) -> dict[str, Any]:
-        """JSON values only."""
+        """The check as JSON values."""
         return asdict(self)
 
     def summary(self) -> tuple[str, ...]:

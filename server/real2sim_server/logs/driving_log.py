@@ -83,7 +83,7 @@ def damage_named(where: str) -> Iterator[None]:
 
 
 class FrameSource(Protocol):
-    """Reads the heavy parts of a log, one file at a time."""
+    """Reads images and sweeps of a log, one file at a time."""
 
     def image(self, camera: str, frame: int) -> NDArray[np.uint8]:
         """RGB [H, W, 3] of a camera at a frame. Raises LogError naming a file it cannot read."""
@@ -134,7 +134,7 @@ class DrivingLog:
         name: short name, from the folder.
         rig: calibrated cameras; images are already undistorted.
         frame_times_us: [F] int64 [us], increasing.
-        ego: ``T_world_vehicle`` at least over all frames (rear axle centre on the ground).
+        ego: ``T_world_vehicle`` (rear axle centre on the ground); covers at least all frames.
         tracks: every tracked object, in a stable order.
         source: reads images and sweeps.
         ego_size: (length, width, height) of the recording vehicle [m].
@@ -286,7 +286,7 @@ def same_part(log: DrivingLog, provenance: Mapping[str, Any]) -> DrivingLog:
 
 
 def log_of_frames(log: DrivingLog, frames: Sequence[int]) -> DrivingLog:
-    """``log`` with only these frames; paths and boxes stay whole."""
+    """``log`` with only these frames. Paths and boxes stay complete."""
     index = np.asarray(frames, np.int64)
     selected = _SelectedFiles if isinstance(log.source, ChecksFiles) else _SelectedFrames
     return replace(

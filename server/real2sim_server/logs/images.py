@@ -38,7 +38,7 @@ def encoded_size(data: bytes, where: str) -> tuple[int, int]:
     """(width, height) [px] of an encoded image, from its header only.
 
     Raises:
-        LogError: ``data`` is neither PNG nor JPEG, or its header is truncated; ``where`` names it.
+        LogError: ``data`` is neither PNG nor JPEG, or its header is truncated; names ``where``.
     """
     size: tuple[int, int] | None = None
     try:

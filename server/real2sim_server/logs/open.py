@@ -1,4 +1,4 @@
-"""Opens a log of any known format."""
+"""Opening of logs in any known format."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def open_log(
         sequence: name of a drive in a folder with several; a single one is the default.
 
     Raises:
-        LogError: no such folder, an unknown format, or any problem found by the reader.
+        LogError: the folder is missing, the format is unknown, or the reader finds a problem.
     """
     folder = Path(path)
     if not folder.is_dir():

@@ -1,5 +1,6 @@
-"""Maps of other programs as lane graphs, one reader per format; unsupported content is rejected by
-name.
+"""Maps of other programs as lane graphs, with one reader per format.
+
+Unsupported content is rejected by name.
 """
 
 from .align import Alignment, align, driven_poses, laid_on

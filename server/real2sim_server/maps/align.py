@@ -1,4 +1,4 @@
-"""A map brought into the frame of a scene: turned, moved and laid on its ground."""
+"""Alignment of a map with a scene: rotation, translation, and heights of the ground."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ..scene import Ground, LaneGraph, Scene, Trajectory
 from .reader import MapError
 
 STEP_M = 2.0
-"""Distance of the poses of a path that are compared with lanes."""
+"""Spacing of the poses of a path that are compared with lanes."""
 VEHICLES = frozenset({"car", "van", "truck", "bus", "vehicle"})
 ROUNDS, HUBER_M = 40, 1.0
 NEAR_M = 6.0
@@ -75,7 +75,7 @@ def align(
     """The rigid motion that aligns a map's lanes with the driven poses.
 
     Args:
-        graph: in the map's own frame.
+        graph: graph in the frame of the map.
         poses: [N, 3] x, y, heading in the scene; see :func:`driven_poses`.
         start: (yaw, x, y) to start from; None: the map's own frame if it almost fits, otherwise
             all possible positions of the first pose on the map.
@@ -97,7 +97,7 @@ def align(
 
 
 def laid_on(graph: LaneGraph, ground: Ground) -> LaneGraph:
-    """The graph with heights of a scene's ground: under every lane, area, stop line and road."""
+    """The graph with the heights of a scene's ground, for lanes, areas, stop lines and roads."""
 
     def on(points: Float) -> Float:
         return np.column_stack([points[:, :2], ground.height_at(points[:, :2])])
@@ -140,7 +140,7 @@ def _offsets(graph: LaneGraph, poses: Float, motion: Float) -> Float:
 def _refined(graph: LaneGraph, poses: Float, start: Float) -> Alignment:
     """Iterated closest lines: Gauss-Newton on offsets from centre lines, with Huber's weights.
 
-    What offsets do not tell (along a straight road) stays as it was.
+    Components that the offsets do not determine (along a straight road) do not change.
     """
     motion = start.copy()
     for _ in range(ROUNDS):
@@ -154,7 +154,7 @@ def _refined(graph: LaneGraph, poses: Float, start: Float) -> Alignment:
         weight = np.minimum(1.0, HUBER_M / np.maximum(np.abs(offset), 1e-9))
         left = np.column_stack([-np.sin(headings), np.cos(headings)])
         x, y = local[known, 0], local[known, 1]
-        # A turn of the map moves a place of the scene within it by (y, -x).
+        # A rotation of the map moves a position of the scene within it by (y, -x).
         jacobian = np.column_stack([left[:, 0] * y - left[:, 1] * x, -left])
         scaled = jacobian * weight[:, None]
         normal = jacobian.T @ scaled + np.diag([1e-3, 1e-3, 1e-3])
@@ -195,7 +195,7 @@ def _measured(graph: LaneGraph, poses: Float, motion: Float) -> Alignment:
 
 
 def _anywhere(graph: LaneGraph, poses: Float) -> Alignment:
-    """The best of all positions of the first pose on a lane."""
+    """The best fit over all positions of the first pose on a lane."""
     starts = [
         (*lane.at(s)[:2], lane.at(s)[3])
         for lane in graph.lanes.values()

@@ -26,7 +26,7 @@ class Argoverse2MapReader:
     expects = f"{PATTERN} of Argoverse 2, its folder map/, or the folder of the log"
 
     def recognises(self, path: Path) -> bool:
-        """Whether it is such a file, or a folder with one."""
+        """Whether the path is a map file, or a folder with one."""
         return _archive(path) is not None
 
     def read(self, path: Path) -> LaneGraph:

@@ -1,4 +1,4 @@
-"""Lanes of a log: from its map, or from the drive alone if there is none."""
+"""Lanes of a log, from its map or, without a map, from the drive."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from .reader import MapError, joined
 
 STEP_M = 1.0
 SAME_LANE_M, SAME_HEADING = 1.7, 0.5
-"""Ways no farther apart, of about one direction, are of one lane."""
+"""Maximum distance of paths in the same lane, with about the same direction."""
 SHARED = 0.6
 MIN_LENGTH_M = 8.0
 BRIDGED_M = 40.0
@@ -39,7 +39,7 @@ markings.
 
 @dataclass(frozen=True)
 class _Way:
-    """A lane in the making: its line, and how far it may be off [m]."""
+    """A lane under construction: its line, and the error of this line [m]."""
 
     line: Float
     width: float
@@ -109,8 +109,8 @@ def _headings(line: Float) -> Float:
 
 
 def _beside(line: Float, other: Float) -> tuple[Float, Float, Float]:
-    """For each point of ``other`` [M]: index of the nearest point of ``line``, signed distance to
-    its left, and cosine of the angle between the directions.
+    """For each point of ``other`` [M]: index of the nearest point of ``line``, distance to the left
+    of it, and cosine of the angle between the directions.
     """
     apart = np.linalg.norm(other[:, None, :2] - line[None, :, :2], axis=2)
     k = apart.argmin(axis=1)
@@ -206,7 +206,7 @@ def _even(line: Float) -> Float:
 
 
 def _ground_returns(log: DrivingLog) -> tuple[Float, Float]:
-    """LiDAR points [N, 3] about the height of the road, in the world, and their intensities."""
+    """LiDAR points [N, 3] near the height of the road, in the world, and their intensities."""
     frames = np.unique(np.linspace(0, log.frame_count - 1, MAX_SWEEPS).astype(int))
     places, levels = [], []
     for frame in frames.tolist():
@@ -224,7 +224,7 @@ def _ground_returns(log: DrivingLog) -> tuple[Float, Float]:
 
 
 def _marked(line: Float, points: Float, intensity: Float) -> _Way:
-    """A lane's line centred between its markings, where they are visible."""
+    """A lane's line, centred between its markings where visible."""
     shifts, widths = [], []
     reach = int(WINDOW_M / STEP_M)
     places = np.arange(0, len(line), reach // 2)
@@ -238,7 +238,7 @@ def _marked(line: Float, points: Float, intensity: Float) -> _Way:
         return _Way(line, WIDTH_M, UNMARKED_M)
     centre = np.array(shifts)[known]
     typical = float(np.median(centre))
-    # A stretch that tells something else than most has taken other marks for its own.
+    # A section that differs from most others has found the wrong markings.
     centre = np.clip(centre, typical - 0.3, typical + 0.3)
     shift = np.interp(np.arange(len(line)), places[known] + reach / 4, centre)
     shift = gaussian_filter1d(shift, reach / 4, mode="nearest")
@@ -308,7 +308,7 @@ def _across(line: Float, points: Float) -> tuple[Float, Float]:
 
 
 def _neighbours(lanes: list[Lane]) -> list[Lane]:
-    """Mark lanes as adjacent that run side by side over most of the shorter one."""
+    """Mark lanes as adjacent if they run side by side over most of the shorter one."""
     found = []
     for lane in lanes:
         beside: dict[str, str | None] = {"left": None, "right": None, "opposite": None}
@@ -369,7 +369,7 @@ def lanes_of_log(log: DrivingLog, *, source: LaneSource = "map") -> LaneGraph | 
 
 
 def _near(graph: LaneGraph, driven: Float, where: str) -> LaneGraph:
-    """The part of a graph within MAP_REACH_M of driven places [N, 2]."""
+    """The part of a graph within MAP_REACH_M of driven positions [N, 2]."""
     tree = cKDTree(driven)
 
     def is_near(points: Float) -> bool:

@@ -111,12 +111,12 @@ class _Osm:
         return np.array([self.places[n] for n in self.ways[way_id]]).reshape(-1, 3)
 
     def member_ways(self, relation: _Relation, role: str) -> list[str]:
-        """Ways of a role, of those that are there."""
+        """Existing ways with a role."""
         named = relation.members.get(role, ())
         return [ref for kind, ref in named if kind == "way" and ref in self.ways]
 
     def notes(self) -> tuple[str, ...]:
-        """Skipped elements by kind, with their number and first names."""
+        """Notes on skipped elements by kind, with their number and first names."""
         return tuple(
             f"{what}: {len(names)} ({', '.join(names[:5])}{', ...' if len(names) > 5 else ''})"
             for what, names in self.left_out.items()
@@ -124,7 +124,7 @@ class _Osm:
 
 
 def _kept(root: ET.Element, kind: str) -> list[ET.Element]:
-    """Elements of a kind, without those that JOSM keeps in the file as deleted."""
+    """Elements of a kind, without those that JOSM has marked as deleted."""
     return [e for e in root.findall(kind) if e.get("action") != "delete"]
 
 
@@ -133,7 +133,7 @@ def _tags(element: ET.Element) -> dict[str, str]:
 
 
 def _places(nodes: Iterable[ET.Element], file: str) -> tuple[dict[str, Float], str]:
-    """Places of nodes: local ones where every node has them, else on a plane about their middle."""
+    """Positions of nodes: local ones if all nodes have them, else on a plane about their centre."""
     found: dict[str, Float] = {}
     degrees: dict[str, tuple[float, float, float]] = {}
     for node in nodes:
@@ -237,7 +237,7 @@ def _rims(osm: _Osm, relation: _Relation) -> tuple[list[str], list[str]] | None:
 
 
 def _chained(osm: _Osm, ways: list[str]) -> list[str]:
-    """Nodes of ways that share ends, from one end to the other."""
+    """Nodes of connected ways, from one end to the other."""
     if not ways:
         return []
     nodes = list(osm.ways[ways[0]])
@@ -270,7 +270,7 @@ def _oriented(osm: _Osm, left: list[str], right: list[str]) -> tuple[Float, Floa
 
 
 class _Index:
-    """Lanelets by the nodes that they begin at, and by their rims as they run."""
+    """Lanelets by their first nodes, and by their borders in driving direction."""
 
     def __init__(self, rims: dict[str, tuple[list[str], list[str]]]) -> None:
         self.rims = rims
@@ -283,12 +283,12 @@ class _Index:
             self.right[tuple(right)].append(key)
 
     def successors(self, key: str) -> tuple[str, ...]:
-        """Lanelets that begin where one ends."""
+        """Lanelets that begin at the end of another one."""
         left, right = self.rims[key]
         return tuple(n for n in self.starts.get((left[-1], right[-1]), ()) if n != key)
 
     def beside(self, key: str) -> dict[str, str | None]:
-        """Neighbours that share a rim."""
+        """Neighbours that share a border."""
         left, right = (tuple(rim) for rim in self.rims[key])
         found = {
             "left": self.right.get(left, ()),
@@ -299,7 +299,7 @@ class _Index:
 
 
 def _may_cross(osm: _Osm, rim: list[str], side: str) -> bool:
-    """Whether the mark along a rim lets its lane's traffic over."""
+    """Whether the marking of a border allows a lane change."""
     way = osm.way_of.get(tuple(rim))
     turned = way is None
     way = way or osm.way_of.get(tuple(reversed(rim)))
@@ -336,7 +336,7 @@ def _speed_limit(osm: _Osm, key: str, relation: _Relation) -> float | None:
 
 
 def _speed(text: str) -> float | None:
-    """A limit [m/s] of a speed with its unit, km/h without one, or of a sign."""
+    """A speed limit [m/s], from a speed with its unit (km/h by default) or from a sign."""
     if sign := GERMAN_LIMIT.match(text.strip()):
         limit = int(sign[1])
         return limit / 3.6 if limit == 5 or (0 < limit <= 130 and limit % 10 == 0) else None
@@ -359,7 +359,7 @@ def _area(osm: _Osm, key: str, relation: _Relation) -> Area | None:
 def _rules(
     osm: _Osm, lanelets: dict[str, _Relation], lanes: set[str]
 ) -> tuple[list[StopLine], list[Signal]]:
-    """Stop lines and signals of regulatory elements, with the lanes that name these."""
+    """Stop lines and signals of regulatory elements, with the lanes that refer to them."""
     ruled: dict[str, list[str]] = defaultdict(list)
     for key, lanelet in lanelets.items():
         for _, ref in lanelet.members.get("regulatory_element", ()):
@@ -372,7 +372,7 @@ def _rules(
         if rule.tags.get("type") != "regulatory_element" or kind is None:
             continue
         waiting = ruled.get(key, [])
-        if kind == "yield":  # of right of way: those that yield wait
+        if kind == "yield":  # right of way: yielding lanes wait
             waiting = [r for _, r in rule.members.get("yield", ()) if r in lanes]
         stop = next(iter(osm.member_ways(rule, "ref_line")), None)
         if stop is not None and len(osm.ways[stop]) >= 2:

@@ -28,7 +28,7 @@ class NuScenesMapReader:
     expects = "a file of nuScenes' map expansion, such as maps/expansion/boston-seaport.json"
 
     def recognises(self, path: Path) -> bool:
-        """Whether it is a JSON file that starts with tables of the expansion."""
+        """Whether the path is a JSON file that starts with tables of the expansion."""
         if not path.is_file() or path.suffix != ".json":
             return False
         head = head_of(path)
@@ -66,7 +66,7 @@ class _Tables:
         }
 
     def rows(self, name: str) -> list[dict[str, Any]]:
-        """Rows of a table; empty if the file has no such table."""
+        """Rows of a table; empty if the file lacks the table."""
         found: list[dict[str, Any]] = self.content.get(name, [])
         return found
 
@@ -109,7 +109,7 @@ class _Tables:
         return found
 
     def stop_lines(self, lanes: list[Lane]) -> list[StopLine]:
-        """The longer centre lines of their polygons, with the lanes that end or lie on them."""
+        """Stop lines along the long axes of their polygons, with their lanes."""
         graph = joined([lane for lane in lanes if lane.junction is None] or lanes)
         found = []
         for row in self.rows("stop_line"):

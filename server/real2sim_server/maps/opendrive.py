@@ -141,15 +141,15 @@ STOP_TYPES, YIELD_TYPES, SPEED_TYPES = {"206"}, {"205"}, {"274"}
 """Sign numbers of the German catalogue, used by most map makers."""
 LIGHT_TYPES = ("1.000.", "1000")
 REACH_M = 25.0
-"""A stop line so near before a signal is the signal's."""
+"""Maximum distance of a stop line before its signal."""
 
 
 def read_signals(
     roads: Mapping[str, OpenDriveRoad], lines: Mapping[str, Road], file: str
 ) -> tuple[list[Signal], list[StopLine]]:
-    """All signals of a file with the lanes that they rule, and its stop lines.
+    """All signals of a file with the lanes that they control, and its stop lines.
 
-    A signal without <validity> rules every lane of the direction that it faces.
+    A signal without <validity> controls every lane of the direction that it faces.
 
     Raises:
         MapError: an attribute is absent or no number.
@@ -202,7 +202,7 @@ def _ruled(element: ET.Element, road: OpenDriveRoad, line: Road, file: str) -> t
             rules = facing == "none" or along == (facing == "+")
         if rules and _is_travelled(road, s, part.number):
             found.append(part)
-    # At the border of two sections, traffic stops at the end of the one it comes from.
+    # At the border of two sections, traffic stops at the end of the section that it leaves.
     waits: dict[int, RoadLane] = {}
     for part in found:
         known = waits.setdefault(part.number, part)
@@ -258,7 +258,7 @@ def _joined(known: Signal, lanes: tuple[str, ...]) -> Signal:
 def _stop_line(
     name: str, element: ET.Element, road: OpenDriveRoad, line: Road, file: str
 ) -> StopLine:
-    """Across all lanes that it rules, at its place."""
+    """A stop line across all controlled lanes, at the position of the signal."""
     s = min(max(number(element, "s", f"{file}: signal {name!r}"), 0.0), line.length)
     lanes = _ruled(element, road, line, file)
     parts = [p for p in line.lanes if p.lane_id in lanes]
@@ -286,7 +286,7 @@ def _with_stop_line(signal: Signal, stop_lines: Mapping[str, StopLine]) -> Signa
 def read_crossings(
     roads: Mapping[str, OpenDriveRoad], lines: Mapping[str, Road], file: str
 ) -> list[Area]:
-    """Crosswalks and parking spaces among the objects that have an outline.
+    """Crosswalks and parking spaces among the objects with an outline.
 
     Raises:
         MapError: an attribute is absent or no number.
@@ -342,7 +342,7 @@ class OpenDriveReader:
     expects = "a file .xodr of OpenDRIVE 1.4 to 1.8 (XML, root <OpenDRIVE>)"
 
     def recognises(self, path: Path) -> bool:
-        """Whether it is a file that begins as one of OpenDRIVE."""
+        """Whether the path is a file that begins like an OpenDRIVE file."""
         return path.is_file() and (path.suffix == ".xodr" or b"<OpenDRIVE" in head_of(path))
 
     def read(self, path: Path) -> LaneGraph:
@@ -427,7 +427,7 @@ class _Build:
         )
 
     def _beside(self, lanes: dict[str, Lane]) -> dict[str, Lane]:
-        """Lanes with their neighbours: of the same direction, and the first of the other."""
+        """Lanes with their neighbours: those of the same direction, and the first opposite one."""
         found = dict(lanes)
         for road in self.roads.values():
             for i, section in enumerate(road.sections):
@@ -514,8 +514,8 @@ def _with_neighbours(
             return n, None, False
         return n, name, runs_along(road, other) == along
 
-    # Numbers increase to the left of the reference line; to the right of a lane that runs against
-    # it.
+    # Numbers increase to the left of the reference line, and to the right of a lane in the opposite
+    # direction.
     (left_n, left, same_left), (right_n, right, same_right) = (
         beside(step) for step in ((1, -1) if along else (-1, 1))
     )
@@ -530,8 +530,8 @@ def _with_neighbours(
 
 
 def _may_cross(lanes: dict[int, SectionLane], own: int, other: int) -> bool:
-    """Whether the mark between two lanes may be crossed: it belongs to the outer one's inner rim,
-    that is to the lane nearer to the reference line."""
+    """Whether the marking between two lanes may be crossed. It is the outer marking of the lane
+    nearer to the reference line."""
     nearer = lanes.get(min(own, other, key=abs))
     if nearer is None or own * other < 0:
         return True
@@ -550,9 +550,9 @@ def _check_version(root: ET.Element, file: str) -> None:
 
 
 def _geo_reference(root: ET.Element, file: str) -> str:
-    """Projection of the file, and the offset of its coordinates for it.
+    """Projection of the file, and the offset between its coordinates and the projection.
 
-    Coordinates stay those of the file, because scenes need small ones.
+    The offset is not applied, because scenes need small coordinates.
     """
     text = " ".join((root.findtext("header/geoReference") or "").split())[:4000]
     offset = root.find("header/offset")

@@ -1,4 +1,4 @@
-"""Roads of an OpenDRIVE file with the lanes of their sections, as the file numbers them."""
+"""Roads of an OpenDRIVE file with the lanes of their sections, with the file's lane numbers."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from .reader import MapError, integer, number
 
 # --- Plan view -----------------------------------------------------------------------------------
 
-# Source: ASAM OpenDRIVE 1.8.1, chapter 9. Cubic curves are measured by arc length, as s is.
+# Source: ASAM OpenDRIVE 1.8.1, chapter 9. Cubic curves are parametrised by arc length, like s.
 
 MAX_LENGTH_M = 1e6
 STRAIGHT = 1e-12
@@ -35,11 +35,11 @@ class Piece:
     """One <geometry>.
 
     Attributes:
-        s: where it starts on the road [m].
-        length: of it [m].
+        s: start position on the road [m].
+        length: length of the piece [m].
         x, y, heading: pose of its start.
         local: its shape.
-        bends: whether it is anything but a line.
+        bends: whether it is not a straight line.
     """
 
     s: float
@@ -64,7 +64,7 @@ class PlanView:
         return last.s + last.length
 
     def at(self, s: Float) -> Float:
-        """x, y [m] and heading [rad], [K, 3], at places ``s`` [K] (held to the line)."""
+        """x, y [m] and heading [rad], [K, 3], at positions ``s`` [K] (clamped to the line)."""
         starts = np.array([piece.s for piece in self.pieces])
         index = np.clip(np.searchsorted(starts, s, side="right") - 1, 0, len(starts) - 1)
         found = np.empty((len(s), 3))
@@ -82,7 +82,7 @@ def read_plan_view(road: ET.Element, where: str) -> PlanView:
     """The reference line of a <road>.
 
     Raises:
-        MapError: without geometry, of a kind that OpenDRIVE does not have, or not in order.
+        MapError: the geometry is missing, of an unknown kind, or out of order.
     """
     pieces: list[Piece] = []
     for element in road.findall("planView/geometry"):
@@ -290,10 +290,10 @@ KINDS: dict[str, LaneKind] = {
     "taxi": "bus",
     "walking": "sidewalk",
 }
-"""By the file's lower-case name; other types are not part of the carriageway."""
+"""Kinds by lower-case name in the file; other types are not part of the carriageway."""
 SPEED_UNITS = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704, "": 1.0}
 CHANGES = {"none": (False, False), "increase": (True, False), "decrease": (False, True)}
-"""For a lane's own mark: whether it can be crossed towards higher and lower numbers."""
+"""By the marking of a lane: whether it may be crossed towards higher and lower numbers."""
 
 
 @dataclass(frozen=True)
@@ -311,7 +311,7 @@ class SectionLane:
 
     Attributes:
         number: negative to the right of the reference line.
-        kind: of the lane.
+        kind: kind of the lane.
         inner, outer: [M] t of its borders at the section's positions [m].
         links: numbers of connected lanes, by "predecessor" and "successor".
         speed_limit: [m/s] or None.
@@ -331,7 +331,7 @@ class SectionLane:
 
 @dataclass
 class Section:
-    """A lane section: places along the road and the lanes there, by number."""
+    """A lane section: positions along the road, and the lanes by number."""
 
     s: Float
     lanes: dict[int, SectionLane] = field(default_factory=dict)
@@ -349,7 +349,7 @@ class OpenDriveRoad:
         drives_right: rule of the road.
         links: by "predecessor" and "successor".
         sections: along s.
-        element: for signals and objects.
+        element: XML element, for signals and objects.
         s: [N] sampled positions [m].
     """
 

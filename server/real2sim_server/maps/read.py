@@ -1,4 +1,4 @@
-"""The readers of maps, and the one function that finds the right one."""
+"""All map readers, and the function that selects one."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ NAME = "lanes.json"
 
 
 class NativeMapReader:
-    """Reads what ``real2sim map --out lanes.json`` and ``GET /v1/scenes/{scene}/lanes`` write."""
+    """Reads the lanes of ``real2sim map --out lanes.json`` or ``GET /v1/scenes/{scene}/lanes``."""
 
     name = "native"
     expects = "lanes.json, or a folder with it"
 
     def recognises(self, path: Path) -> bool:
-        """Whether it is a document of lanes, or a folder with ``lanes.json``."""
+        """Whether the path is a document of lanes, or a folder with ``lanes.json``."""
         if path.is_dir():
             return (path / NAME).is_file()
         return path.suffix == ".json" and b'"real2sim-lanes"' in head_of(path)
@@ -53,7 +53,7 @@ def register_map_reader(reader: MapReader) -> None:
     """Register a reader from outside this package for :func:`read_map`.
 
     Args:
-        reader: of a format that no other reader recognises.
+        reader: reader of a format that no other reader recognises.
 
     Raises:
         ValueError: a reader with that name is registered.

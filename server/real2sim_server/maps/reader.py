@@ -21,7 +21,7 @@ class MapReader(Protocol):
     """Reads one format of maps.
 
     Attributes:
-        name: of the format, for ``read_map(format=...)``.
+        name: name of the format, for ``read_map(format=...)``.
         expects: one line for users with the required file or folder.
     """
 
@@ -92,14 +92,14 @@ def read_json(path: Path) -> dict[str, Any]:
 
 # --- XML -----------------------------------------------------------------------------------------
 
-# Files are not trusted.
+# Files are untrusted.
 
 
 def read_xml(path: Path, root: str) -> ET.Element:
     """The root element of an XML file.
 
     Args:
-        path: of the file.
+        path: path of the file.
         root: expected name of the element.
 
     Raises:
@@ -111,7 +111,7 @@ def read_xml(path: Path, root: str) -> ET.Element:
         data = path.read_bytes()
     except OSError as error:
         raise MapError(f"{path}: cannot be read ({error.strerror})") from error
-    # Entities could blow a small file up to fill the memory, and no map needs any.
+    # Entities could expand a small file until it fills the memory; maps do not need them.
     if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
         raise MapError(f"{path}: declares a document type or entities; maps have none")
     try:
@@ -152,7 +152,7 @@ def number(element: ET.Element, name: str, where: str, default: float | None = N
 
 
 def integer(element: ET.Element, name: str, where: str) -> int:
-    """A whole attribute. Raises MapError."""
+    """An integer attribute. Raises MapError."""
     value = number(element, name, where)
     if value != int(value):
         raise MapError(f"{where}: {name} of <{element.tag}> must be whole, not {value}")
@@ -166,14 +166,14 @@ SAME_PLACE_M = 1e-3
 
 
 def between(left: Float, right: Float) -> tuple[Float, Float] | None:
-    """Centre line [N, 3] and widths [N] of the lane between two borders, every metre or so; None if
+    """Centre line [N, 3] and widths [N] of the lane between two borders, about every metre; None if
     they have no length.
 
     Both borders are traversed in parallel, by their share of length, as in Lanelet2 and Argoverse.
     """
     if len(left) < 2 or len(right) < 2:
         return None
-    # The rims of some maps run against each other.
+    # In some maps, the two borders of a lane have opposite directions.
     if np.linalg.norm(left[0] - right[0]) + np.linalg.norm(left[-1] - right[-1]) > np.linalg.norm(
         left[0] - right[-1]
     ) + np.linalg.norm(left[-1] - right[0]):

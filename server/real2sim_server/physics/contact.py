@@ -288,7 +288,7 @@ INSIDE = F32(0.25)
 """A body with its centroid this close to a node surrounds it and has no normal there [cells]."""
 CRUSHED = F32(1.1)
 """Minimum rest volumes per cell of a crushed body. An intact body that slides past a node also
-surrounds it, but at its rest density."""
+surrounds it, but at rest density."""
 
 
 @device_function
@@ -449,10 +449,10 @@ def resolve_node_pair(
 ) -> None:  # fmt: skip
     """Contact of two bodies at a node, if their surfaces touch.
 
-    The normal is that of the body whose surface there is more like a face; the normal of an edge
-    would let it plough through a face. There is no contact between surfaces that do not face each
-    other, unless one body is crushed and surrounds the node. Each surface is that of a half-space
-    with the same centroid.
+    The normal is that of the body whose surface at the node is more like a face, because an edge
+    could plough through a face along its own normal. Surfaces that do not face each other have no
+    contact, unless one body is crushed and surrounds the node. Each surface is approximated by a
+    half-space with the same centroid.
     """
     ma, mb = node_a[3], node_b[3]
     volume_a, volume_b = moment_a[3], moment_b[3]

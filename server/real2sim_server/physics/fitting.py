@@ -151,7 +151,7 @@ class _Search:
         self._history = [*self._history[:1], _size(self._off)]
 
     def descend(self, steps: int) -> None:
-        """Take steps until they no longer help."""
+        """Take steps until they no longer reduce the residual."""
         damping, spans = DAMPING, list(SPANS[1:])
         for _ in range(steps):
             step = _step(self._J, self._off, damping)
@@ -248,9 +248,9 @@ def _size(off: Float) -> float:
 # on a grid always rebounds too well, so removing energy is enough. Kelvin-Voigt damping of the
 # first mode, omega = pi c / 2L, gives e = e0 exp(-pi zeta / sqrt(1 - zeta^2)), zeta = eta omega / 2
 # (lambda + 2 mu). This is the first guess; test impacts of the body refine it. The rebound depends
-# on the position of the wall between grid nodes: an elastic block of six cells keeps 0.64 of its
-# speed on a wall through nodes and 0.88 on one just below them. The test impacts therefore use the
-# actual wall if it is given.
+# on the position of the wall relative to grid nodes: an elastic block of six cells keeps 0.64 of
+# its speed on a wall through nodes and 0.88 on a wall just below them. The test impacts therefore
+# use the actual wall if it is given.
 
 TOLERANCE = 0.015
 """Maximum difference between achieved and requested restitution at which a fit stops."""

@@ -241,8 +241,8 @@ def named_material(name: str, **values: float) -> Material:
     """The material registered under a name, with the given values replaced.
 
     Raises:
-        MaterialError: for an unknown name, with the allowed ones; for a value that the material
-            does not have, or out of range.
+        MaterialError: the name is unknown (the message lists the allowed ones), the material has
+            no such parameter, or a value is out of range.
     """
     if name not in MATERIALS:
         raise MaterialError(f"unknown material {name!r}; allowed are {', '.join(MATERIALS)}")

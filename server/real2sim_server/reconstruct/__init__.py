@@ -1,4 +1,4 @@
-"""From driving logs to scenes of Gaussians."""
+"""Reconstruction of Gaussian scenes from driving logs."""
 
 from .evaluation import CoverageReport, CoverageScore, evaluate_views
 from .initialise.stage0 import initialise_scene

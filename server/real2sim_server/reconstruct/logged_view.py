@@ -21,7 +21,7 @@ EDGES = np.array([(a, a | bit) for bit in (1, 2, 4) for a in range(8) if not a &
 
 
 def image_time(log: DrivingLog, camera: str, frame: int) -> int:
-    """When the image was taken [us], held to the span of the ego path."""
+    """Time of the image, clamped to the span of the ego path [us]."""
     t_us = log.image_time_us(camera, frame)
     return int(min(max(t_us, log.ego.start_us), log.ego.end_us))
 
@@ -45,7 +45,7 @@ def points_in_camera(
     vehicles is not compensated: it is a few decimetres at most, on few points.
 
     Args:
-        sweep: of ``frame``; None reads it.
+        sweep: sweep of ``frame``; None reads it.
     """
     T_world_vehicle = log.ego.transform(int(log.frame_times_us[frame]))
     T_camera_vehicle = camera.viewmat(log.ego.transform(t_us)) @ T_world_vehicle
@@ -54,7 +54,7 @@ def points_in_camera(
 
 
 def moving_tracks(log: DrivingLog) -> tuple[ObjectTrack, ...]:
-    """Tracks that lead anywhere, see ``Trajectory.moves``."""
+    """Moving tracks, see ``Trajectory.moves``."""
     return tuple(track for track in log.tracks if track.trajectory.moves)
 
 
@@ -71,7 +71,7 @@ def tracks_mask(
     Occlusion by other objects is ignored.
 
     Args:
-        tracks: with the boxes.
+        tracks: tracks with the boxes.
         camera: gives size and K.
         T_world_camera: [4, 4], OpenCV camera frame.
         t_us: time [us]; a track just outside its time span counts, see
@@ -105,7 +105,7 @@ def _boxes_mask(boxes: Iterable[Float], camera: Camera, T_world_camera: Float) -
 
 
 def box_outline(corners: Float, k: Float) -> Float:
-    """Convex hull [P, 2] [px] of a box on the image; empty behind the camera.
+    """Convex hull [P, 2] of a box on the image [px]; empty behind the camera.
 
     Args:
         corners: [8, 3] in the camera frame [m], in the order of ``box_corners``.
@@ -149,40 +149,40 @@ def fill_outline(mask: NDArray[np.bool_], outline: Float) -> None:
 # The search starts in image columns in which the uppermost LiDAR beams got no return. In each of
 # them the sky ends at the first strong edge. The edge threshold minimises the variance of the
 # colours above and below the border (Shen and Wang 2013). From there the sky grows into other
-# columns, over its own colours and up to the next edge. Patches of the same colours elsewhere in
-# the open columns, such as between a bridge and the trees behind it, count as well. A smooth wall
-# that continues above the uppermost beam does not.
+# columns, over similar colours and up to the next edge. Patches of the same colours elsewhere in
+# the open columns, for example between a bridge and the trees behind it, also count as sky. Smooth
+# walls that continue above the uppermost beam do not.
 
 WIDTH = 640
-"""Larger images are masked at this width [px]."""
+"""Maximum width at which images are masked [px]."""
 BOX_MARGIN = 0.3
-"""Kept free around the boxes of objects [m]."""
+"""Margin around the boxes of objects without sky [m]."""
 UPPERMOST = math.radians(1.5)
-"""Returns within this angle of the highest one are from the uppermost beams."""
+"""Maximum angle below the highest return of returns from the uppermost beams."""
 FAR = 10.0
-"""Least distance of returns that tell how high a sensor looks [m]."""
+"""Minimum distance of the returns that determine the highest elevation [m]."""
 OPEN_MARGIN = 3
-"""Columns on each side of one with a high return that are not open either."""
+"""Number of columns on each side of a high return that are also blocked."""
 GRADIENTS = np.linspace(5.0, 300.0, 40)
-"""Candidates for the least gradient of the border (Sobel, of grey from 0 to 255)."""
+"""Candidates for the minimum gradient of the border (Sobel, of grey from 0 to 255)."""
 SKY_WEIGHT = 2.0
 """Weight of the variance of the sky's colours against the variance of the rest."""
 GROWING_GRADIENT = 40.0
 """Maximum gradient across which the sky grows beyond open columns."""
 MIN_SHARE = 0.005
-"""Least part of the open columns that counts as sky, and as something else."""
+"""Minimum fraction of the open columns for the sky, and for the rest."""
 MIN_PATCH = 0.0005
-"""Least part of an image that counts as a patch apart from the sky at the top."""
+"""Minimum area of a sky patch separate from the sky at the top, as a fraction of the image."""
 ALIKE = 3.0
-"""A colour within this many standard deviations belongs to the sky."""
+"""Maximum distance of sky colours from the mean, in standard deviations."""
 MIN_DEVIATION = 4.0
-"""Minimum standard deviation of the sky's colours, of 255: they may all be overexposed."""
+"""Minimum standard deviation of the sky's colours, 0 to 255, for overexposed skies."""
 TRIMMINGS = 3
-"""Rounds of dropping outliers beyond that, such as a tree at the top."""
+"""Rounds of dropping outliers, such as a tree at the top."""
 BRIGHTER = 1.2
-"""The sky is at least this many times as bright as the rest of the image."""
+"""Minimum ratio of the brightness of the sky to the rest of the image."""
 CLEAR = 2
-"""Pixels around a LiDAR return that are not sky."""
+"""Radius around LiDAR returns without sky [px]."""
 
 
 def sky_mask(
@@ -196,11 +196,11 @@ def sky_mask(
     """Sky pixels [H, W] of an image of a log; none without LiDAR.
 
     Args:
-        log: with poses.
-        camera: of ``log``, at the size of ``image``.
-        frame: of ``log``.
+        log: log with poses.
+        camera: camera of ``log``, at the size of ``image``.
+        frame: frame of ``log``.
         image: [H, W, 3] RGB.
-        sweep: of ``frame``; None reads it.
+        sweep: sweep of ``frame``; None reads it.
 
     Raises:
         LogError: the sweep cannot be read.
@@ -268,7 +268,7 @@ def _outside_of_boxes(log: DrivingLog, camera: Camera, frame: int) -> NDArray[np
 
 
 def _above_horizon(camera: Camera, pose: Float) -> NDArray[np.bool_]:
-    """[H, W] pixels that look upwards."""
+    """[H, W] bool, pixels above the horizon."""
     v, u = np.mgrid[: camera.height, : camera.width] + 0.5
     rays, valid = camera.unproject(np.stack([u, v], -1))
     return valid & (rays @ pose[2, :3] > 0)
@@ -285,7 +285,7 @@ def _pixels(camera: Camera, points: Float) -> tuple[NDArray[np.int64], NDArray[n
 
 
 def _hit(camera: Camera, pixels: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """[H, W] pixels that are near those of returns [M, 2]."""
+    """[H, W] bool, pixels near those of the returns [M, 2]."""
     import cv2
 
     u, v = pixels[(pixels[:, 1] >= 0) & (pixels[:, 1] < camera.height)].T
@@ -295,11 +295,11 @@ def _hit(camera: Camera, pixels: NDArray[np.int64]) -> NDArray[np.bool_]:
 
 
 def _is_high(sweep: LidarSweep) -> NDArray[np.bool_]:
-    """Which returns [N] of a sweep are from its uppermost beams."""
+    """Mask [N] of the returns of a sweep from its uppermost beams."""
     x, y, z = (sweep.points - sweep.origin).astype(np.float64).T
     distance = np.hypot(x, y)
     elevation = np.arctan2(z, distance)
-    # The lasers of a sensor are centimetres apart: near returns seem higher or lower than they are.
+    # The lasers of a sensor are centimetres apart, which distorts the elevation of near returns.
     far = elevation[distance > FAR]
     top = float(np.quantile(far, 0.999)) if len(far) else math.pi
     return np.asarray(elevation > top - UPPERMOST)
@@ -320,7 +320,7 @@ def _open_columns(
 
 
 def _first_row(ends: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Row [W] of the first set pixel in each column of [H, W]; H if there is none."""
+    """Row [W] of the first set pixel in each column of [H, W]; H for none."""
     return np.where(ends.any(0), ends.argmax(0), len(ends))
 
 
@@ -350,7 +350,7 @@ def _spreads(sums: Float) -> Float:
 
 
 def _like_most(image: NDArray[np.uint8], colours: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Pixels [H, W] of an image that are coloured as most of ``colours`` [N, 3] are."""
+    """Pixels [H, W] of an image with colours like most of ``colours`` [N, 3]."""
     given, values = colours.astype(np.float64), image.astype(np.float64)
     for _ in range(TRIMMINGS):
         given = given[_near(given, given)]
@@ -358,7 +358,7 @@ def _like_most(image: NDArray[np.uint8], colours: NDArray[np.uint8]) -> NDArray[
 
 
 def _near(values: Float, colours: Float) -> NDArray[np.bool_]:
-    """Which of ``values`` [..., 3] are within some standard deviations of ``colours`` [N, 3]."""
+    """Mask [...] of ``values`` [..., 3] within a few standard deviations of ``colours`` [N, 3]."""
     spread = np.cov(colours.T, bias=True) + MIN_DEVIATION**2 * np.eye(3)
     off = values - colours.mean(0)
     return np.asarray(((off @ np.linalg.inv(spread)) * off).sum(-1) < ALIKE**2)

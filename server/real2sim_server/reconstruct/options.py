@@ -13,7 +13,7 @@ from ..maps import LANE_SOURCES, LaneSource
 
 
 class ReconstructError(ValueError):
-    """A log that cannot be reconstructed; the message says what is missing or allowed."""
+    """A log cannot be reconstructed. The message names the missing part or the allowed values."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class InitialiseOptions:
 # Names, times and progress of stages.
 
 OnProgress = Callable[[str, int, int], None]
-"""Called with the name of a stage, how many of its steps are done, and how many it has."""
+"""Called with the name of a stage, its completed steps and its total steps."""
 ReportStep = Callable[[int, int], None]
 
 

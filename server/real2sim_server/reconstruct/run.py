@@ -1,4 +1,4 @@
-"""From the folder of a log to a scene bundle with a report."""
+"""Reconstruction of a log folder into a scene bundle with a report."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from .training import OnTraining, TrainOptions, held_out_frames, train, with_box
 
 EVALUATED_FRAMES = 4
 MIN_VIEWS, STEPS_A_VIEW = 4, 30
-"""Minimum number of views for uncertainty after a training, and training steps per further view: a
+"""Minimum number of views for uncertainty after training, and training steps per further view. A
 view costs about as much as a step.
 """
 
@@ -32,15 +32,15 @@ class TrainingFigures:
     """Results of training.
 
     Attributes:
-        iterations: of training; ``steps`` of them in this run, the rest before it was resumed.
-        steps: see above.
+        iterations: total number of iterations, including those before a resume.
+        steps: iterations in this run.
         seconds: duration of ``steps``.
         rate: steps per second.
         psnr, ssim: means over all held-out views at training size; PSNR in [dB].
         psnr_objects: PSNR over the boxes of moving objects in these views [dB].
-        held_out_frames: frames that neither stage 0 nor training has read.
-        stage_ms: milliseconds of a step by stage.
-        folder: with checkpoint, metrics and preview pictures.
+        held_out_frames: frames used neither in stage 0 nor in training.
+        stage_ms: time per step by stage [ms].
+        folder: folder with checkpoint, metrics and preview pictures.
     """
 
     iterations: int
@@ -62,7 +62,7 @@ class ReconstructReport:
     Attributes:
         scene: folder of the bundle.
         preview: PNG of a logged image above its rendered view.
-        frames, cameras: of the log.
+        frames, cameras: numbers of frames and cameras of the log.
         objects: number of objects.
         gaussians: number in background and objects.
         background_gaussians: number in the background.
@@ -98,9 +98,9 @@ class ReconstructOptions:
     Attributes:
         initialise: options of stage 0; None uses those of ``training``.
         training: None builds from LiDAR without training.
-        box_noise: noise added to the boxes of the log, to measure how well training corrects it;
-            see ``with_box_noise``.
-        backend: of the renderer; training runs on its device.
+        box_noise: noise added to the boxes of the log, for measuring its correction by training;
+        see ``with_box_noise``.
+        backend: backend of the renderer; training runs on its device.
     """
 
     initialise: InitialiseOptions | None = None
@@ -195,7 +195,7 @@ def reconstruct(
 
 @dataclass(frozen=True)
 class _Callbacks:
-    """Callbacks of progress, and where times are collected."""
+    """Progress callbacks and collected times."""
 
     on_progress: OnProgress | None
     on_training: OnTraining | None
@@ -243,7 +243,7 @@ def _train(
 
 
 def _evaluated_frames(log: DrivingLog, figures: TrainingFigures | None) -> list[int]:
-    """A few frames all over the log, of those held out where there are any."""
+    """A few frames spread over the log, held-out ones if available."""
     held_out = figures.held_out_frames if figures else []
     if not held_out:
         return chosen_frames(log, EVALUATED_FRAMES)

@@ -273,7 +273,7 @@ def empty_statistics(
 
 
 def screen_scale(request: RasterRequest) -> tuple[float, float]:
-    """Scale factors of gradients by x and y [px]; see ScreenStatistics."""
+    """Scale factors of gradients with respect to x and y [px]; see ScreenStatistics."""
     return request.cameras * request.width / 2, request.cameras * request.height / 2
 
 
@@ -318,7 +318,7 @@ class ScreenTracker:
 
 
 class ScreenWatch:
-    """Sums over pixels of absolute gradients [V, 2] by the centres of V splats of one camera."""
+    """Sums over pixels of absolute gradients [V, 2] of the centres of V splats of one camera."""
 
     def __init__(self, count: int) -> None:
         self.absolute = torch.zeros(count, 2, dtype=torch.float64)
@@ -336,7 +336,7 @@ class ScreenWatch:
 # Warm-up: small requests that together cover every path of a backend
 
 MANY = 5_000
-"""More Gaussians than a backend treats as one block."""
+"""Number of Gaussians that exceeds a block of any backend."""
 
 
 def warm_up_requests() -> Iterator[RasterRequest]:

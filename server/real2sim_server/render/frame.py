@@ -459,7 +459,7 @@ def refuse_lenses(backend: Backend, cameras: Sequence[Camera]) -> None:
 
 def kernels_of_lenses_on_disk() -> bool:
     """Whether the disk cache has the slowest kernels of :func:`warm_up_lenses`."""
-    from ._cpu.ray_project import project_rays  # Imported only where it is needed.
+    from ._cpu.ray_project import project_rays  # Imported lazily, because it is rarely needed.
 
     return is_on_disk(project_rays)
 

@@ -1,4 +1,4 @@
-"""From rendered arrays to files: camera effects, quantization, encoding, and videos."""
+"""Camera effects, quantization, encoding and videos of rendered images."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ CPU_ONLY: Final = -99999
 """Device id with which nvImageCodec uses the CPU (libjpeg-turbo)."""
 PROOF_QUALITY = 95
 PROOF_LEVELS = 12
-"""Maximum channel error of the decoded sample image, of 255."""
+"""Maximum channel error of the decoded sample image, in 8-bit levels."""
 
 log = logging.getLogger(__name__)
 
@@ -607,14 +607,14 @@ def _check_whole(file: Path) -> None:
 
 
 def _raise_write_error(file: Path) -> None:
-    """Raise the system's error for writes to a file, if they still fail."""
+    """Raise the system's error if writes to the file still fail."""
     with file.open("ab", buffering=0) as opened:
         opened.write(b"\0")
         os.fsync(opened.fileno())
 
 
 def _end_of_matroska(opened: BinaryIO) -> int | None:
-    """End of the segment that holds the video (RFC 9559, 5.1)."""
+    """End of the segment with the video (RFC 9559, 5.1)."""
     header = opened.read(256)
     at = header.find(MATROSKA_SEGMENT)
     start = at + len(MATROSKA_SEGMENT) + 8
@@ -638,7 +638,7 @@ def _end_of_mp4(opened: BinaryIO) -> int | None:
 
 
 def _name_webm(file: Path) -> None:
-    """Change the document type of a Matroska file that holds VP8 to WebM."""
+    """Change the document type of a Matroska file with VP8 to WebM."""
     with file.open("r+b") as opened:
         header = opened.read(256)
         at = header.find(MATROSKA_DOCTYPE)

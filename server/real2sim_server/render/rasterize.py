@@ -63,9 +63,9 @@ def rasterize(
 ) -> RenderOutput:
     """Draw instances from C cameras of one size, with the semantics of gsplat 1.5.3.
 
-    RGB, alpha and depth carry gradients wherever an input requires them: all parts of clouds,
-    ``covars``, object poses, ``viewmats`` and the faces of the sky. The direction in which a pixel
-    sees the sky, ``Ks``, ``scale`` and ``background`` are constants.
+    RGB, alpha and depth carry gradients with respect to all parts of clouds, ``covars``, object
+    poses, ``viewmats`` and the faces of the sky, if these require them. The direction in which a
+    pixel sees the sky, ``Ks``, ``scale`` and ``background`` are constants.
 
     Gaussians are projected by the local affine approximation (EWA, Zwicker et al. 2001), sorted
     by the depth of their centres (ties keep list order) and blended front to back

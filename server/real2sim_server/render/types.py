@@ -118,10 +118,10 @@ class ScreenStatistics:
         radii: [C, N] float32 each, half the longer side of the screen bounding box [px], rounded
             up; 0 if a Gaussian was not drawn.
         gradients: [N, 2] float32 each, zero until backward: sums over cameras of the norm of the
-            loss gradient by the screen position. Column 0 uses the gradient itself, column 1 the
-            sum over pixels of its absolute value (absgrad, Ye et al. 2024). Before the norm, x is
-            multiplied by C width / 2 and y by C height / 2 as in gsplat's DefaultStrategy, so that
-            its thresholds apply. A second backward adds to them.
+            loss gradient with respect to the screen position. Column 0 uses the gradient, column 1
+            the sum over pixels of its absolute value (absgrad, Ye et al. 2024). Before the norm, x
+            is multiplied by C width / 2 and y by C height / 2 as in gsplat's DefaultStrategy, so
+            that its thresholds apply. A second backward adds to them.
     """
 
     radii: tuple[Tensor, ...]

@@ -1,4 +1,4 @@
-"""Scenarios as people write them: OpenSCENARIO files, and a gallery of corner cases."""
+"""Scenarios: OpenSCENARIO files, and a gallery of corner cases."""
 
 
 class ScenarioError(ValueError):

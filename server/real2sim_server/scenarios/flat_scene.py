@@ -56,7 +56,7 @@ def fitted_to_scene(
     Args:
         board: the storyboard. If the scene has no map, its road network is assumed to be straight
             with lanes 3.5 m wide.
-        scene: to run it on.
+        scene: scene for the run.
         start_us: start of the episode [us]; None: start of the recording.
 
     Raises:
@@ -141,7 +141,7 @@ def _ego_place(board: Storyboard) -> Any:
 
 
 def _axle_ahead(board: Storyboard, scene: Recorded) -> float:
-    """How far the ego's rear axle is ahead of its reference point [m]."""
+    """Distance from the ego's reference point forward to its rear axle [m]."""
     ego = next((e for e in resolved(board).entities if e.kind == "ego"), None)
     centre = None if ego is None or board.version < 2 else own_centre(ego, scene.ego_size)
     return 0.0 if centre is None else centre[0] - (scene.ego_size[0] / 2 - REAR_OVERHANG)
@@ -165,11 +165,11 @@ BEFORE, SECONDS = 60.0, 40.0
 """Length of the road behind the ego's start [m]; duration of the recorded drive [s]."""
 
 MIN_EGO_SPEED, GAIN = 5.0, 1.0
-"""The recorded drive speeds up to this at least, so that it leads somewhere [m/s], [m/s^2]."""
+"""Minimum speed that the recorded drive reaches [m/s], and its acceleration [m/s^2]."""
 
 STEP_US = 100_000
 AWAY = (-1000.0, 0.0, -50.0)
-"""Out-of-sight position of objects that only provide appearances [m]."""
+"""Out-of-sight position of objects that only define appearances [m]."""
 ASPHALT, PAINT, GRASS = (0.33, 0.33, 0.35), (0.92, 0.92, 0.9), (0.42, 0.5, 0.36)
 COLOURS = {
     "car": (0.75, 0.16, 0.14), "van": (0.85, 0.85, 0.82), "truck": (0.2, 0.35, 0.6),
@@ -185,7 +185,7 @@ def flat_scene(
     """A scene for a storyboard without a recording.
 
     Its recorded drive starts at the storyboard's ego position with the ego's speed and size, and
-    follows the lane. Without an ego it goes straight on from the origin.
+    follows the lane. Without an ego it runs straight ahead from the origin.
 
     Args:
         board: the storyboard.
@@ -195,7 +195,7 @@ def flat_scene(
     Raises:
         ScenarioError: the road network is required and missing, or the storyboard refers to objects
             of a scene.
-        MapError: it cannot be read.
+        MapError: the road network cannot be read.
         WorldError: the ego has no valid position on it.
     """
     graph = _graph(board, road_file)
@@ -265,7 +265,7 @@ def _way(start: Place, graph: LaneGraph | None) -> Way:
     return Way("", 0, True, path)
 
 
-# --- what is seen -----------------------------------------------------------------------------
+# --- appearance -------------------------------------------------------------------------------
 
 
 def _surface(points: Float, headings: Sequence[float]) -> list[GaussianCloud]:
@@ -290,7 +290,7 @@ def _surface(points: Float, headings: Sequence[float]) -> list[GaussianCloud]:
 
 
 class _Paint(NamedTuple):
-    """What a strip looks like: spacing [m], colour, height [m], period of dashes or 0 [m]."""
+    """Appearance of a strip: spacing [m], colour, height [m], period of dashes or 0 [m]."""
 
     step: float
     colour: tuple[float, float, float]
@@ -314,7 +314,7 @@ def _strip(path: LoggedPath, length: float, offsets: Float, paint: _Paint) -> Ga
 
 
 def _lane_lines(graph: LaneGraph | None) -> list[GaussianCloud]:
-    """Middles of all lanes of a map, thin."""
+    """Thinned centre lines of all lanes of a map."""
     found = []
     for lane in graph.lanes.values() if graph is not None else ():
         yaws = np.unwrap(lane.headings)
@@ -326,9 +326,9 @@ def _lane_lines(graph: LaneGraph | None) -> list[GaussianCloud]:
 
 
 def _looks() -> dict[str, SceneObject]:
-    """A person, and a box per other category, that provide appearances.
+    """A person, and a box for each other category, that define appearances.
 
-    They are out of sight, before the start of the drive. Stationary tracks may be extended when an
+    They are out of sight, before the start of the drive. Stationary tracks may be extended if an
     episode is longer than the log.
     """
     found = {}
@@ -409,7 +409,7 @@ def _cameras() -> tuple[Camera, ...]:
 
 
 def _looking(position: tuple[float, float, float], down: float) -> Float:
-    """``T_vehicle_camera`` of a camera that looks ahead, so far down [rad]."""
+    """``T_vehicle_camera`` of a camera that looks ahead, pitched down by an angle [rad]."""
     cos, sin = math.cos(down), math.sin(down)
     T = np.eye(4)
     T[:3, :3] = np.array([[0.0, -sin, cos], [-1.0, 0.0, 0.0], [0.0, -cos, -sin]])

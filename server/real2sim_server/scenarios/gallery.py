@@ -40,7 +40,7 @@ class CornerCase:
         """The storyboard with other values for some parameters.
 
         Raises:
-            ValueError: a parameter that it does not have.
+            ValueError: the case has no parameter of that name.
         """
         if unknown := sorted(set(parameters) - set(self.parameters)):
             raise ValueError(
@@ -55,14 +55,14 @@ class CornerCase:
 
 
 GALLERY: dict[str, CornerCase] = {}
-"""By name."""
+"""Cases by name."""
 
 
 def corner_case(name: str) -> CornerCase:
     """The case with a name, with or without the prefix ``gallery:``.
 
     Raises:
-        ValueError: there is none.
+        ValueError: the gallery has no such case.
     """
     found = GALLERY.get(name.removeprefix("gallery:"))
     if found is None:
@@ -109,13 +109,13 @@ MASSES = {
     "pedestrian": 75.0, "cyclist": 90.0, "van": 2200.0, "motorcycle": 280.0, "animal": 60.0,
     "obstacle": 20.0,
 }  # fmt: skip
-"""By category, where it is not a car [kg]."""
+"""Mass by category, except cars [kg]."""
 
 EGO_WIDTH = 1.85
 """Width of the ego, for impact positions as a share of it [m]."""
 
 ALONG = {"h": 0.0, "relative": True}
-"""In the direction of the ego's road, also in lanes on its left."""
+"""Orientation along the ego's road, also in lanes on its left."""
 
 AGAINST = {"h": 3.141592653589793, "relative": True}
 
@@ -169,19 +169,19 @@ def when(test: Fields, **more: Any) -> Fields:
 
 
 def after(seconds: Any) -> Fields:
-    """So long after the episode began."""
+    """Triggered a time after the start of the episode."""
     return when({"kind": "simulation_time", "rule": "greater_or_equal", "value": seconds})
 
 
 def done(event: str) -> Fields:
-    """Once an event is complete."""
+    """Triggered when an event is complete."""
     return when(
         {"kind": "element_state", "element_type": "event", "element": event, "state": "complete"}
     )
 
 
 def near(entity: str, gap: Any, *, of: str = "Ego") -> Fields:
-    """Once the ego is so near to it along the lane, bumper to bumper."""
+    """Triggered at a distance of the ego along the lane, bumper to bumper."""
     return when(
         {
             "kind": "relative_distance", "entities": [of], "entity": entity,
@@ -202,7 +202,7 @@ def in_time(entity: str, seconds: Any) -> Fields:
 
 
 def event(name: str, start: Fields, *actions: Fields) -> Fields:
-    """Actions that begin when something holds."""
+    """An event: actions with a start trigger."""
     return {
         "name": name, "start": start,
         "actions": [{"name": f"{name}_{a['kind']}", "action": a} for a in actions],
@@ -269,7 +269,7 @@ def cmrb() -> Fields:
     braking=8.0,
 )
 def hard_brake() -> Fields:
-    """At the gap, not at a time."""
+    """Triggered by the gap, not by time."""
     init = put("target", ahead(30.0), "$speed")
     brake = event("brake", near("target", "$gap"), speed_to(0.0, "$braking"))
     return board([("target", "car", CAR)], init, target=[brake])
@@ -366,7 +366,7 @@ def pull_out() -> Fields:
     behind=20.0, speed=15.0, duration=2.5,
 )  # fmt: skip
 def lss_overtaking() -> Fields:
-    """Euro NCAP's overtaking vehicle, which returns too early."""
+    """Euro NCAP's overtaking vehicle, but with an early return."""
     init = put("overtaker", ahead("${-1 * $behind}", lanes=1, orientation=ALONG), "$speed")
     past = when(
         {
@@ -381,7 +381,7 @@ def lss_overtaking() -> Fields:
 
 @case("lanes", "LSS lane keeping: the ego begins headed over the line", offset=0.5, heading=0.05)
 def lss_keep() -> Fields:
-    """Euro NCAP's drift of 0.2 to 0.6 m/s sideways: at 10 m/s as much as 0.02 to 0.06 rad."""
+    """Euro NCAP's lateral drift of 0.2 to 0.6 m/s: 0.02 to 0.06 rad at 10 m/s."""
     there = ahead(0.0, offset="$offset", orientation={"h": "$heading", "relative": True})
     return board([], [{"entity": "Ego", "action": {"kind": "teleport", "position": there}}])
 
@@ -404,7 +404,7 @@ def wrong_way() -> Fields:
     offset=0.9,
 )
 def ccfhos() -> Fields:
-    """Euro NCAP CCFhos: head-on, straight; overlap of a half."""
+    """Euro NCAP CCFhos: head-on, straight, 50 % overlap."""
     against = ahead("$ahead", offset="$offset", orientation=AGAINST)
     return board([("target", "car", CAR)], put("target", against, "$speed"))
 
@@ -425,7 +425,7 @@ def ccfhol() -> Fields:
     ahead=90.0, speed=8.0, distance=45.0, drift=2.0,
 )  # fmt: skip
 def lss_oncoming() -> Fields:
-    """Euro NCAP's oncoming vehicle, which drifts in this case."""
+    """Euro NCAP's oncoming vehicle, but drifting."""
     init = put("oncoming", ahead("$ahead", lanes=1), "$speed")
     how = {"shape": "sinusoidal", "acceleration": 0.8}
     aside = {"kind": "lane_offset", "offset": "$drift", **how}
@@ -523,7 +523,7 @@ def occluded_pedestrian() -> Fields:
     ahead=45.0, distance=4.0, speed=1.39, impact=0.5, stop=3.2, pause=1.5,
 )  # fmt: skip
 def hesitating_pedestrian() -> Fields:
-    """Stops after so far, for so long."""
+    """Stops after a distance, for a duration."""
     walked = {"kind": "traversed_distance", "entities": ["crosser"], "value": "$stop"}
     stood = {"kind": "stand_still", "entities": ["crosser"], "duration": "$pause"}
     walking = {"groups": [
@@ -574,7 +574,7 @@ def cbfa() -> Fields:
     impact=0.5,
 )
 def animal() -> Fields:
-    """As fast as a roe deer trots."""
+    """Speed of a trotting roe deer."""
     return _crossing("animal", DEER, NEAR)
 
 

@@ -29,14 +29,14 @@ MAX_WIDTH_M = 20.0
 """Maximum distance to either side of the ego's lane [m]."""
 
 ASPECT = 3.0
-"""Width by height, of all pictures."""
+"""Aspect ratio (width by height) of all pictures."""
 
 ASPHALT, GRASS, PAINT = "#8b8f94", "#c9d3bd", "#f2f2ee"
 EGO, OTHERS = "#2166d1", ("#c8402e", "#d68a1c", "#7b3fa0")
 
 
 class BoxPose(NamedTuple):
-    """Somebody at an instant: middle of their box [m], heading [rad]."""
+    """Pose of an entity at an instant: centre of the box [m], heading [rad]."""
 
     x: float
     y: float
@@ -62,8 +62,8 @@ def picture_of(case: CornerCase, scene: Scene) -> str:
     one of them, or has passed.
 
     Args:
-        case: of the gallery, with its default parameters.
-        scene: a plain one, as of :func:`plain_scene`.
+        case: case of the gallery, with default parameters.
+        scene: a scene like that of :func:`plain_scene`.
     """
     return _drawn(case.title, _courses(case, scene))
 
@@ -80,7 +80,7 @@ def main() -> None:
         (PICTURES / f"{case.name}.svg").write_text(picture_of(case, scene), encoding="utf-8")
 
 
-# --- driven -------------------------------------------------------------------------------------
+# --- paths --------------------------------------------------------------------------------------
 
 
 def _with_speed(board: Storyboard) -> Storyboard:
@@ -123,7 +123,7 @@ def _passed(courses: Sequence[DrivenBox]) -> bool:
     return bool(others) and behind
 
 
-# --- drawn --------------------------------------------------------------------------------------
+# --- drawing ------------------------------------------------------------------------------------
 
 
 def _drawn(title: str, courses: Sequence[DrivenBox]) -> str:

@@ -1,6 +1,6 @@
-"""The world as data: Gaussians, objects with trajectories, sky, cameras.
+"""Scene data: Gaussians, objects with trajectories, sky, cameras.
 
-Independent of simulation time and of HTTP.
+This package is independent of simulation time and of HTTP.
 """
 
 from .asset import Asset

@@ -1,4 +1,4 @@
-"""Assets: objects that any scene can take, and people built from the body model."""
+"""Assets: objects that can be inserted into any scene, and people built from the body model."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Asset:
         cloud: Gaussians in the object frame: origin at the box centre, x forward, z up.
         provenance: origin of the asset (JSON values only).
         content_hash: SHA-256 of the bundle on disk; empty if not saved.
-        figure: of a walking person, with ``cloud`` in the rest pose; or None.
+        figure: figure of a walking person, with ``cloud`` in the rest pose; or None.
 
     Raises:
         SceneError: ``size`` is not three positive lengths, or the figure belongs to another cloud.
@@ -79,7 +79,7 @@ OPACITY = 0.97
 THICKNESS = 0.004
 """Standard deviation along the normal [m]."""
 STROLL = 1.4
-"""Walking at this speed fits in the box [m/s]."""
+"""Walking speed that determines the size of the box [m/s]."""
 
 _WEARS = {
     "head": "skin", "hand": "skin", "hair": "hair", "torso": "top", "upper": "top",
@@ -104,7 +104,7 @@ def person_asset(
     Args:
         asset_id: name of the asset.
         build: a build of the body model, for example ``woman`` or ``boy``.
-        height: of the person [m]; default: height of the build.
+        height: height of the person [m]; by default that of the build.
         clothes: colours that differ from ``CLOTHES``.
         worn: garments from ``WORN``.
         gaussians: number of Gaussians.
@@ -163,11 +163,12 @@ def _extent(body: Body) -> tuple[Float, Float]:
 def _samples(
     body: Body, triangles: NDArray[np.int64], count: int
 ) -> tuple[NDArray[np.int64], Float]:
-    """Vertices [N, 3] of triangles, sampled by area, and barycentric coordinates [N, 3]; the same
-    for the same body.
+    """Vertices [N, 3] of triangles, sampled by area, and barycentric coordinates [N, 3].
+
+    The samples are deterministic.
     """
     area = _areas(body, triangles)
-    # Evenly along the summed area, so that no patch stays bare.
+    # Even steps of the cumulative area leave no patch bare.
     along = (np.arange(count) + 0.5) / count * area.sum()
     chosen = triangles[np.searchsorted(np.cumsum(area), along).clip(max=len(triangles) - 1)]
     u, v = np.random.default_rng(7).random((2, count))
@@ -218,12 +219,12 @@ def _cloud(  # noqa: PLR0917 - a surface, its samples and their colours
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
     along = edge / np.maximum(np.linalg.norm(edge, axis=1, keepdims=True), 1e-12)
     frames = np.stack([along, np.cross(normal, along), normal], axis=-1)
-    # Half the parallelograms' areas are the triangles'.
+    # A triangle has half the area of its parallelogram.
     spread = np.sqrt(_areas(body, triangles).sum() / 2 / len(chosen))
     scales = np.broadcast_to([spread, spread, THICKNESS], means.shape)
     main = chosen[np.arange(len(chosen)), shares.argmax(axis=1)]
     painted = np.array([_colour(name, colours) for name in body.model.part_names])
-    # Light comes from above: shapes would be flat without it.
+    # Shade with light from above, otherwise shapes look flat.
     lit = painted[body.model.parts[main]] * (0.8 + 0.2 * normal[:, 2:])
     return GaussianCloud(
         means=_tensor(means),

@@ -59,17 +59,18 @@ class Shutter:
 
     @property
     def rolls(self) -> bool:
-        """Whether rows or columns are exposed one after the other."""
+        """Whether rows or columns are exposed in sequence."""
         return self.direction != "global"
 
     @property
     def by_row(self) -> bool:
-        """Whether the pixels of a row are exposed together, else those of a column."""
+        """True if the pixels of a row are exposed together, False if those of a column are."""
         return self.direction in {"top_to_bottom", "bottom_to_top"}
 
     def line_times(self, width: int, height: int) -> NDArray[np.float64]:
-        """Exposure time of each row (or column), 0 to 1 over the readout; NCore's convention: the
-        first at 0, the last at 1.
+        """Exposure time of each row (or column), from 0 to 1 over the readout.
+
+        As in NCore, the first is at 0 and the last at 1.
         """
         count = height if self.by_row else width
         times = np.arange(count) / max(count - 1, 1)
@@ -110,7 +111,7 @@ class Optics:
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A calibrated camera on the vehicle: a pinhole, unless it has a lens.
+    """A calibrated camera on the vehicle: a pinhole camera unless it has a lens.
 
     Attributes:
         name: unique on its rig.
@@ -175,7 +176,7 @@ class Camera:
             )
 
     def as_recorded(self) -> Camera:
-        """The device itself, with its original distortion and shutter; the same camera if these are
+        """The physical camera, with its original distortion and shutter; this camera if these are
         unknown.
         """
         if self.recorded is None:
@@ -194,8 +195,8 @@ class Camera:
         return self.lens is not None and not self.lens.perspective
 
     def project(self, points: Float) -> tuple[Float, NDArray[np.bool_]]:
-        """Image positions [..., 2] [px] of points [..., 3] in the camera frame, and whether the
-        lens sees them. Positions can be outside the image; those of unseen points are arbitrary.
+        """Image positions [..., 2] [px] of points [..., 3] in the camera frame, and a mask [...] of
+        visible points. Positions can be outside the image; those of invisible points are arbitrary.
         """
         points = np.asarray(points, dtype=np.float64)
         if self.lens is not None:
@@ -326,7 +327,7 @@ def moved(pose: Float, linear: Any, angular: Any, seconds: float) -> Float:
 
 
 def turned(vector: Float) -> Float:
-    """The rotation [3, 3] about ``vector`` [3] by its length [rad]."""
+    """The rotation matrix [3, 3] of a rotation vector [3] [rad]."""
     angle = float(np.linalg.norm(vector))
     if angle == 0:
         return np.eye(3)

@@ -103,7 +103,7 @@ def sh_rotation(rotation: Float, degree: int) -> Float:
 
 
 def rotate_sh(sh: Tensor, rotation: Float) -> Tensor:
-    """Coefficients [N, K, 3] of the same Gaussians after turning them by ``rotation`` [3, 3]."""
+    """Coefficients [N, K, 3] of the same Gaussians after ``rotation`` [3, 3]."""
     if sh.shape[1] == 1:
         return sh
     degree = round(sh.shape[1] ** 0.5) - 1
@@ -122,7 +122,7 @@ def _spread_directions(count: int = 64) -> Float:
 
 SH_DEGREES = {1: 0, 4: 1, 9: 2, 16: 3}
 UNSEEN = 0.25
-"""Uncertainty where no training ray passed: about the absolute error of a guessed colour."""
+"""Uncertainty without training rays: roughly the absolute error of a guessed colour."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,7 +184,7 @@ class GaussianCloud:
         return int(self.means.shape[0])
 
     def tensors(self) -> dict[str, Tensor]:
-        """Its tensors by name, without absent ones."""
+        """The tensors by name, without absent ones."""
         named = ((field.name, getattr(self, field.name)) for field in fields(self))
         return {name: tensor for name, tensor in named if tensor is not None}
 
@@ -222,7 +222,7 @@ class GaussianCloud:
         return GaussianCloud(**{name: t.to(device) for name, t in self.tensors().items()})
 
     def select(self, index: Tensor) -> GaussianCloud:
-        """The Gaussians picked by a mask [N] bool or indices [M] int64."""
+        """The Gaussians selected by a mask [N] bool or indices [M] int64."""
         return GaussianCloud(**{name: t[index].contiguous() for name, t in self.tensors().items()})
 
     def by_importance(self) -> Tensor:
@@ -243,7 +243,7 @@ class GaussianCloud:
         return replace(self, sh=sh)
 
     def with_uncertainties(self) -> GaussianCloud:
-        """The same Gaussians with uncertainties: their own, or UNSEEN where none are known."""
+        """The same Gaussians with uncertainties, UNSEEN if unknown."""
         if self.uncertainties is not None:
             return self
         return replace(self, uncertainties=torch.full_like(self.opacities, UNSEEN))
@@ -251,7 +251,7 @@ class GaussianCloud:
     def moved(self, T_dst_src: ArrayLike, *, scale: float = 1.0) -> GaussianCloud:
         """The Gaussians in another frame: scaled about the origin, then placed by ``T_dst_src``.
 
-        Turns the spherical harmonics too, so that the cloud looks the same from every side.
+        The spherical harmonics are rotated too, so that the cloud looks the same from every side.
 
         Args:
             T_dst_src: [4, 4] rigid transform from this cloud's frame to the new one.
@@ -282,7 +282,7 @@ class GaussianCloud:
         directions.
 
         Args:
-            factors: of x, y and z, > 0.
+            factors: factors along x, y and z, > 0.
 
         Raises:
             SceneError: a factor is not positive.
@@ -327,7 +327,7 @@ class GaussianCloud:
     def concatenate(clouds: list[GaussianCloud]) -> GaussianCloud:
         """All Gaussians of ``clouds`` (one frame, one device) in one, at the highest SH degree.
 
-        Where only some have uncertainties, those of the others are UNSEEN.
+        If only some clouds have uncertainties, the others get UNSEEN.
         """
         if not clouds:
             return GaussianCloud.empty()

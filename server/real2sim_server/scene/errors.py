@@ -2,7 +2,7 @@
 
 SceneError
 ├── TimeOutOfRangeError   a pose was requested outside a trajectory
-├── UnknownObjectError    an object id that the scene does not have
+├── UnknownObjectError    an object id missing from the scene
 ├── LidarError            a LiDAR out of range, or a name missing from the catalogue
 ├── RadarError            a name missing from the catalogue of radars
 └── BundleError           a file that is not a readable scene or splat file
@@ -21,7 +21,7 @@ class TimeOutOfRangeError(SceneError, ValueError):
 
 
 class UnknownObjectError(SceneError, KeyError):
-    """An object id that the scene does not have."""
+    """The object id is missing from the scene."""
 
     def __str__(self) -> str:
         return str(self.args[0]) if self.args else ""
@@ -40,4 +40,4 @@ class BundleError(SceneError, ValueError):
 
 
 class BundleTooLargeError(BundleError):
-    """A file would exceed the memory limit when read, however small it is itself."""
+    """The content of a file exceeds the memory limit."""

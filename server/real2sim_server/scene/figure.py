@@ -3,8 +3,8 @@
 A person's cluster is stored in the rest pose of the body model. The trajectory determines the pose
 at each time: footsteps are placed along the path by the distance covered
 (:mod:`real2sim_server.body.gait`), so another path or speed gives other steps. Poses are tabulated
-on demand, one segment at a time, and interpolated. A person without a trajectory walks straight on
-with every step of a :class:`Stride`.
+on demand, one segment at a time, and interpolated. A person without a trajectory walks straight
+ahead, as given by a :class:`Stride`.
 
 Linear blend skinning moves the means. The blended quaternion of the joints, the rotation nearest to
 the blended transforms, rotates a Gaussian; its scales do not change.
@@ -72,7 +72,7 @@ def pose_gaussians(  # noqa: PLR0917
                 continue
             for c in range(12):
                 blend[c] += share * rows[j, c]
-            # Both signs of a quaternion are one rotation: those of the first joint's side add up.
+            # q and -q are the same rotation: align signs with the first joint before blending.
             same = 0.0
             for c in range(12, 16):
                 same += rows[j, c] * rows[first, c]
@@ -98,24 +98,24 @@ def pose_gaussians(  # noqa: PLR0917
 ROW_US = 20_000
 """Spacing of tabulated poses [us]; joints move linearly in between."""
 PIECE = 100
-"""Poses that are tabulated at once."""
+"""Number of poses tabulated at once."""
 KEPT_PIECES, KEPT_CLOUDS = 16, 4
 MAX_DURATION_US = 3_600_000_000
-"""People on longer trajectories do not move their limbs [us]."""
+"""Maximum duration of trajectories with moving limbs [us]."""
 PACE, FASTEST = 0.05, 8.0
-"""Spacing of the paces that striding is tabulated for, and the last of them [m/s]."""
+"""Spacing and maximum of the tabulated paces [m/s]."""
 STRIDE_ROWS = 48
 """Number of tabulated poses in a stride of two steps."""
 KEPT_PACES, KEPT_STYLES = 64, 16
 SETTLING = 0.3
-"""Somebody's pace follows the speed within this time [s]."""
+"""Time in which the pace follows the speed [s]."""
 
 
 class Stride(NamedTuple):
     """Walking state of a person without a trajectory.
 
     Attributes:
-        steps: number so far; each whole number is one swing of a foot.
+        steps: number of steps so far; each whole number is one swing of a foot.
         pace: speed that determines the step length [m/s].
     """
 
@@ -129,7 +129,7 @@ class Figure:
 
     Attributes:
         shape: [<= 12] coefficients of the body model's shapes.
-        height: of the body [m].
+        height: height of the body [m].
         middle: height of the object's origin above the body's, which is on the ground [m].
         joints: [N, 4] uint8, joints that move a Gaussian.
         weights: [N, 4] float32 of these joints; each row sums to one.
@@ -189,7 +189,7 @@ class Figure:
         return body
 
     def styled(self, **style: float) -> Figure:
-        """The same person in another walking style; the same object for the same style.
+        """The same person in another walking style; this object if the style is equal.
 
         Args:
             style: fields of :class:`..body.gait.GaitStyle`; other fields do not change.
@@ -224,8 +224,8 @@ class Figure:
             raise SceneError(f"{what}: weights of a figure must be positive and sum to one")
 
     def check_cloud(self, cloud: GaussianCloud, what: str) -> None:
-        """Raise SceneError unless ``cloud`` can follow it: as many Gaussians, with one colour
-        each for all directions."""
+        """Raise SceneError unless ``cloud`` has the same number of Gaussians, and colours without
+        view dependence."""
         if len(cloud) != len(self):
             raise SceneError(f"{what}: a figure of {len(self)} rows for {len(cloud)} Gaussians")
         if cloud.sh_degree:
@@ -238,8 +238,8 @@ class Figure:
         """``cloud`` in its pose at ``t_us`` along ``trajectory``.
 
         Args:
-            cloud: in the rest pose, frame of the object.
-            trajectory: of the object; its origin is ``middle`` above the ground.
+            cloud: cloud in the rest pose, frame of the object.
+            trajectory: trajectory of the object; its origin is ``middle`` above the ground.
             t_us: time [us]; outside the trajectory, the pose at its nearer end is used.
 
         Returns:
@@ -249,10 +249,10 @@ class Figure:
             return self._walk(trajectory).cloud(cloud, t_us)
 
     def striding(self, cloud: GaussianCloud, stride: Stride) -> GaussianCloud:
-        """``cloud`` walking straight on, for callers that move it themselves.
+        """``cloud`` walking straight ahead, for callers that move the object themselves.
 
         Args:
-            cloud: in the rest pose, frame of the object.
+            cloud: cloud in the rest pose, frame of the object.
             stride: walking state.
         """
         return self._binding.posed(cloud, *self._stride_joints(stride))
@@ -277,7 +277,7 @@ class Figure:
         """COCO's 17 keypoints [17, 3], frame of the object [m].
 
         Args:
-            trajectory: of the object.
+            trajectory: trajectory of the object.
             t_us: instant on the trajectory [us].
             stride: walking state, in place of the trajectory.
         """
@@ -294,7 +294,7 @@ class Figure:
         return points
 
     def _walk(self, trajectory: Trajectory) -> _Walk:
-        """The walk along a trajectory, cached for its lifetime; needs the lock."""
+        """The walk along a trajectory, cached for its lifetime. The caller must hold the lock."""
         walk = self._walks.get(trajectory)
         if walk is None:
             walk = self._walks[trajectory] = _Walk(self, trajectory)
@@ -323,7 +323,7 @@ class Figure:
         return _between((turns[row], places[row]), (turns[row + 1], places[row + 1]), gone - row)
 
     def _tabulated(self, pace: float) -> tuple[Float, Float]:
-        """Joints of a stride straight on at an even pace, and its first pose once more."""
+        """Joints of a stride straight ahead at constant pace; the last pose repeats the first."""
         rate = pace / self._step_length(pace)
         times = np.zeros(STRIDE_ROWS + 1)
         seconds = 1.0
@@ -340,7 +340,7 @@ class Figure:
 
 
 def _joints_at(body: Body, gait: Gait, times: ArrayLike) -> tuple[Float, Float]:
-    """Rotations [T, J, 4] and places [T, J, 3] of joints at ``times`` [T] [s]."""
+    """Rotations [T, J, 4] and positions [T, J, 3] of joints at ``times`` [T] [s]."""
     transforms = joint_transforms(body, gait.pose(times))
     return matrix_to_quaternion(transforms[..., :3]), joint_positions(body, transforms)
 
@@ -366,8 +366,8 @@ class _Binding:
     weights: NDArray[np.float32]
 
     def posed(self, cloud: GaussianCloud, turns: Float, places: Float) -> GaussianCloud:
-        """``cloud`` with joints turned [J, 4] against the rest pose, at places [J, 3]."""
-        # Rest positions and places in the frame of the object.
+        """``cloud`` with joints rotated [J, 4] from the rest pose, at positions [J, 3]."""
+        # Rest and current positions in the frame of the object.
         down = np.array([0.0, 0.0, self.middle])
         rest = self.body.joints - down
         shifts = places - down - (quaternion_to_matrix(turns) @ rest[:, :, None])[..., 0]

@@ -26,8 +26,8 @@ from .trajectory import Trajectory
 # Kernels.
 
 HALF_WHEELBASE, HALF_TRACK = 1.0, 0.8
-"""How far ahead, behind and aside of a place its slope is taken [m]: a wheel apart, so that
-neither the noise of single cells nor the edge of one decides how a vehicle leans."""
+"""Distances ahead, behind and to the sides at which the slope is sampled [m]. At the size of a
+vehicle, noise and edges of single cells do not tilt it."""
 
 
 @func
@@ -52,13 +52,13 @@ def height_under(heights: Any, frame: Any, x: float, y: float) -> Any:
 
 @kernel
 def height_at(heights: Any, frame: Any, x: float, y: float) -> Any:
-    """Ground height [m] below one place."""
+    """Ground height [m] below one position."""
     return height_under(heights, frame, x, y)
 
 
 @kernel
 def heights_at(heights: Any, frame: Any, points: Any) -> Any:
-    """Ground heights [S] float64 [m] below places [S, 2]."""
+    """Ground heights [S] float64 [m] below positions [S, 2]."""
     found = np.empty(len(points))
     for k in range(len(points)):
         found[k] = height_under(heights, frame, points[k, 0], points[k, 1])
@@ -85,7 +85,7 @@ def normal_over(heights: Any, frame: Any, x: float, y: float, yaw: float) -> Any
 
 @kernel
 def normals_at(heights: Any, frame: Any, points: Any) -> Any:
-    """Unit normals [S, 3] float64 of the ground below places [S, 2]."""
+    """Unit normals [S, 3] float64 of the ground below positions [S, 2]."""
     found = np.empty((len(points), 3))
     for k in range(len(points)):
         found[k] = normal_over(heights, frame, points[k, 0], points[k, 1], 0.0)
@@ -115,7 +115,8 @@ class Ground:
     """Heights on a grid in the world. Immutable and shared.
 
     Heights are bilinear between cell centres; outside the grid, the nearest point of its border is
-    used. Each position has one height: where a bridge crosses a road, the height of the driven one.
+    used. Each position has one height. Where a bridge crosses a road, it is the height of the road
+    that was driven.
 
     Attributes:
         origin: [2] float64, corner of cell (0, 0) [m].
@@ -219,9 +220,9 @@ _making = threading.Lock()
 
 
 def of_bundle(content_hash: str, make: Callable[[], Ground]) -> Ground:
-    """The ground of the bundle with that hash, from memory or from ``make``.
+    """The ground of the bundle with that hash, cached or from ``make``.
 
-    A scene and its summaries share one ground, and none is fitted twice.
+    A scene and its summaries share one ground, so that it is fitted only once.
     """
     with _making:
         known = _of_bundles.get(content_hash)
@@ -307,7 +308,7 @@ class RecordedPath:
 
 @dataclass(frozen=True, eq=False)
 class OccupiedCells:
-    """Ground cells that hold something opaque.
+    """Ground cells with opaque Gaussians above them.
 
     Attributes:
         origin: [2] lowest corner [m].
@@ -327,9 +328,9 @@ def occupied_cells(background: GaussianCloud, ground: Ground, path: EgoPath) -> 
     opacity, between 0.4 and 1.6 m above the ground. The corridor of the recording vehicle is free.
 
     Args:
-        background: of a scene.
-        ground: of the same scene.
-        path: of the recording vehicle.
+        background: background of a scene.
+        ground: ground of the same scene.
+        path: path of the recording vehicle.
     """
     opaque = (background.opacities > OBSTACLE_OPACITY).cpu().numpy()
     points = background.means.cpu().numpy().astype(np.float64)[opaque]
@@ -350,7 +351,7 @@ def occupied_cells(background: GaussianCloud, ground: Ground, path: EgoPath) -> 
 
 
 def _clear_driven(occupied: NDArray[np.bool_], lower: Float, path: EgoPath) -> None:
-    # From behind the rear axle at the start to the front bumper at the end.
+    # The corridor extends from the rear bumper at the start to the front bumper at the end.
     length = float(path.s[-1])
     at = np.arange(-1.0, length + 4.0, OBSTACLE_CELL)
     x = np.interp(at, path.s, path.positions[:, 0])

@@ -83,16 +83,16 @@ def _linear(
 Size = tuple[float, float, float]
 
 REACH = 70.0
-"""The ground reaches this far around the drive [m]."""
+"""Extent of the ground around the drive [m]."""
 
 
 class Level(NamedTuple):
     """One pass of the fit.
 
     Attributes:
-        cell: of its grid [m].
+        cell: cell size of its grid [m].
         tolerance: points within this distance of the previous level are on the ground [m].
-        growth: of the tolerance with distance from the drive.
+        growth: growth of the tolerance with the distance from the drive.
         fraction: quantile of a cell's heights that is used. Objects are never below the ground,
             and the lowest point of all is noise. Coarse cells contain walls, whose feet are used.
     """
@@ -109,11 +109,11 @@ LEVELS = (
     Level(0.25, 0.15, 0.0, 0.35),
 )
 FEW_POINTS = 5_000
-"""With fewer ground points, the finest level adds nothing to the previous one."""
+"""Minimum number of ground points for the finest level."""
 CONTINUED = 1e-3
 """Weight of cells without data; it preserves the surface so far within about 30 cells from data."""
 CLOSING = ((25.0, 1.5), (REACH, 4.0))
-"""Up to this distance from the drive, gaps of up to twice this many metres are closed."""
+"""Distance from the drive up to which gaps are closed, and half the size of these gaps [m]."""
 DRIVEN = 3.0
 """The ground is known within this distance of the drive, measured or not [m]."""
 
@@ -122,10 +122,11 @@ FURTHEST = 1e6
 SPACING = 0.5
 """Spacing of positions along the driven path [m]."""
 TRUSTED = 10.0
-"""A plane under the path is trusted this far to the side [m]; beyond, its border height is used."""
+"""Distance to the side up to which a plane under the path is used [m]. Its border height is used
+beyond."""
 MANY = 50_000
 MIN_UPRIGHT = 0.5
-"""Normals that lean more than 60 degrees are not ground; the ground counts as level there."""
+"""Minimum z of ground normals (60 degrees). The ground counts as level where they lean more."""
 UNDER_WHEELS = (1.25, 2.0)
 """The ground is the plane under the path up to the first distance from it, and the surface fitted
 to points beyond the second [m].
@@ -135,25 +136,25 @@ FADE_WIDTH = 8.0
 [m].
 """
 SMOOTHED = 4
-"""Standard deviation of that rise along the path, in places of it."""
+"""Smoothing of this offset along the path, standard deviation in path positions."""
 
 AROUND, UNDER = 2.5, 1.0
-"""Points this far around a projected box and so far below its bottom are looked at [m]."""
+"""Margin around a projected box, and depth below its bottom, of the candidate points [m]."""
 ON_PLANE = 0.08
-"""Inliers of RANSAC are this near to the plane [m]."""
+"""Maximum distance of RANSAC inliers from the plane [m]."""
 ROUNDS, SAMPLE = 400, 5_000
 LEAN_MAX = float(np.cos(np.radians(25)))
 STRETCH = 30.0
 """Length of path over which the road counts as planar [m]."""
 FEW_INLIERS = 100
 OFF_PATH = 0.3
-"""A plane farther from the driven path than this is not the road [m]."""
+"""Maximum distance of the road plane from the driven path [m]."""
 EGO_BOX = (4.6, 1.85, 1.6)
 """Size of the ego's box in the search for the road below its path [m]."""
 
 
 class Standing(Protocol):
-    """An object that stands on the ground: of a scene, its summary, or a track of a log."""
+    """An object on the ground: from a scene, its summary, or a track of a log."""
 
     @property
     def size(self) -> Size: ...  # noqa: D102
@@ -166,8 +167,8 @@ class GroundFit:
     """Result of a fit.
 
     Attributes:
-        ground: for a scene: on the driven path it has the heights and slopes that were driven.
-        surface: on the same grid, as the points alone have it.
+        ground: ground of the scene, with the driven heights and slopes on the driven path.
+        surface: ground from the points alone, on the same grid.
         distance: [X, Y] float32, of each cell from the drive [m].
     """
 
@@ -182,15 +183,15 @@ class GroundFit:
 def fit_ground(points: Float, path: DrivenPath, boxes: BoxBottoms) -> GroundFit:
     """Fit the ground, coarse to fine, starting from the driven path.
 
-    On each level a cell gets a low quantile of its points that agree with the previous level. Cells
-    without such points get the bottom of a box that stood there, or the plane under the path if
-    they were driven over; all others are interpolated from their neighbours. The same points give
-    the same bits.
+    On each level, a cell gets a low quantile of its points that agree with the previous level.
+    Cells without such points get the bottom of a box at that position, or the plane under the path
+    if they were driven over. All others are interpolated from their neighbours. The result is
+    deterministic, bit for bit.
 
     Args:
-        points: [N, 3], background in the world [m]; without points, path and boxes are used alone.
+        points: [N, 3], background in the world [m]; if empty, only path and boxes are used.
         path: driven by the vehicle.
-        boxes: objects that stand on the ground and hide it.
+        boxes: objects on the ground that hide it.
     """
     coarsest = LEVELS[0].cell
     low = np.floor((path.points[:, :2].min(axis=0) - REACH) / coarsest) * coarsest
@@ -215,7 +216,7 @@ def fit_scene_ground(cloud: GaussianCloud, ego: Trajectory, objects: Iterable[St
     Args:
         cloud: the background, world frame; on any device.
         ego: path of the recording vehicle, which moved on the ground.
-        objects: that stood on the ground.
+        objects: objects on the ground.
     """
     points = ground_points(cloud)
     path = road_under(points, DrivenPath.of(ego))
@@ -223,8 +224,8 @@ def fit_scene_ground(cloud: GaussianCloud, ego: Trajectory, objects: Iterable[St
 
 
 def ground_points(cloud: GaussianCloud) -> Float:
-    """Centres [N, 3] float64 of Gaussians that may be ground: opaque ones, without the flat upright
-    ones, which are walls.
+    """Centres [N, 3] float64 of Gaussians that may be ground: opaque, and not flat and upright like
+    walls.
     """
     means, opacities = (v.detach().cpu().numpy() for v in (cloud.means, cloud.opacities))
     scales, quats = (v.detach().cpu().numpy() for v in (cloud.scales, cloud.quats))
@@ -238,7 +239,7 @@ def ground_points(cloud: GaussianCloud) -> Float:
 
 
 OPAQUE = 0.3
-"""Fainter Gaussians tell nothing of the ground."""
+"""Minimum opacity of Gaussians used for the ground."""
 FLAT, LYING = 0.5, 0.7
 """A Gaussian is flat if its shortest axis is below this fraction of the next one, and horizontal if
 that axis is within 45 degrees of vertical.
@@ -300,8 +301,8 @@ class DrivenPath:
         return distance, self.points[nearest, 2] - fraction * slope
 
     def nearest(self, xy: Float) -> tuple[Float, NDArray[np.int64]]:
-        """Distance [N] [m] and index [N] of the nearest place of the path."""
-        # For few positions threads cost more than they save; the results are the same.
+        """Distance [N] [m] and index [N] of the nearest position of the path."""
+        # Threads only pay off for many positions. The results are the same.
         workers = -1 if len(xy) > MANY else 1
         distance, index = self._tree.query(xy, workers=workers)
         return np.asarray(distance), np.asarray(index)
@@ -327,8 +328,8 @@ def _apart(positions: Float) -> list[int]:
 def _through_path(surface: Ground, distance: NDArray[np.float32], path: DrivenPath) -> Ground:
     """Bend the surface so that it passes through the path.
 
-    The driven path is certain, and recorded poses must be on the surface. To the sides, the surface
-    keeps its shape and is raised or lowered to meet the path.
+    Recorded poses must be on the surface. To the sides, the surface keeps its shape and is raised
+    or lowered to meet the path.
     """
     from scipy.ndimage import gaussian_filter1d
 
@@ -363,7 +364,7 @@ class RoadPlane:
 
     Attributes:
         normal: [3] unit, upwards.
-        offset: of its points along the normal [m].
+        offset: offset of its points along the normal [m].
         candidates: [K] indices of the points around the projected boxes.
         inliers: [K] bool, candidates on the plane.
         rms: distance of inliers from the plane, root mean square [m].
@@ -388,7 +389,7 @@ def find_road_plane(
     Args:
         points: [N, 3] of the background, world [m].
         boxes: (``T_world_box`` [4, 4], (length, width, height)) of objects on the road.
-        seed: of RANSAC's samples; the same seed gives the same plane.
+        seed: seed of RANSAC's samples; the same seed gives the same plane.
 
     Raises:
         SceneError: no boxes, fewer than three points around them, or no nearly level plane.
@@ -409,7 +410,7 @@ def find_road_plane(
 
 def road_under(points: Float, path: DrivenPath) -> DrivenPath:
     """The path with the road planes that RANSAC finds below it, section by section. Sections
-    without a plane near the path keep the ego's own.
+    without a plane near the path keep the plane of the ego.
     """
     moved, normals = path.points.copy(), path.normals.copy()
     places = max(round(STRETCH / SPACING), 1)
@@ -565,7 +566,7 @@ def _fit_level(known: _Known, grid: _Grid, level: Level, coarser: _Fitted | None
 
 
 def _by_cell(points: Float, grid: _Grid, fraction: float) -> tuple[NDArray[np.int64], Float, Float]:
-    """Cells that hold points, the z of the one at ``fraction`` from below, and their numbers."""
+    """Cells with points, the quantile ``fraction`` of their z, and their numbers of points."""
     cell = grid.cells(points[:, :2])
     order = np.lexsort((points[:, 2], cell))
     cells, starts, counts = np.unique(cell[order], return_index=True, return_counts=True)
@@ -622,8 +623,9 @@ def box_bottoms(
     *,
     margin: float = 0.4,
 ) -> BoxBottoms:
-    """Bottoms of boxes at the given times at which they exist. Without times, at their own poses;
-    long tracks contribute ``POSES`` evenly spread ones.
+    """Bottoms of boxes at those of the given times at which they exist.
+
+    Without times, the poses of the tracks are used, at most ``POSES`` evenly spread ones per track.
     """
     points, footprints = [np.zeros((0, 3))], [np.zeros((0, 4, 2))]
     for thing in standing:

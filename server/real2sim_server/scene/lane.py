@@ -26,7 +26,7 @@ class RoadLane:
     """A section of a numbered lane of a road.
 
     Attributes:
-        number: of the lane: negative to the right of the reference line, positive to its left.
+        number: number of the lane, negative to the right of the reference line, else positive.
         lane_id: the corresponding lane of the graph.
         s: [M] float64, increasing positions along the road [m], M >= 2.
         inner: [M] float64, t of the border towards the reference line [m].
@@ -114,7 +114,7 @@ class Road:
         return x, y, z, heading
 
     def sample(self, s: ArrayLike, t: ArrayLike = 0.0) -> Float:
-        """[K, 4] float64: x, y, z [m] and heading [rad] of places (``s`` [K], ``t`` [K])."""
+        """[K, 4] float64: x, y, z [m] and heading [rad] of positions (``s`` [K], ``t`` [K])."""
         s = np.clip(np.asarray(s, dtype=np.float64), self.s[0], self.s[-1])
         k = np.clip(np.searchsorted(self.s, s, side="right") - 1, 0, len(self.s) - 2)
         step = self.s[k + 1] - self.s[k]
@@ -143,7 +143,7 @@ class Road:
         """The section of lane ``number`` at ``s`` [m]; the later one at a border.
 
         Raises:
-            SceneError: there is no such lane; the message lists the lanes.
+            SceneError: the lane does not exist; the message lists the lanes.
         """
         there = [p for p in self.lanes if p.s[0] - 1e-6 <= s <= p.s[-1] + 1e-6]
         for part in reversed(there):
@@ -161,12 +161,12 @@ class Road:
         """x, y, z [m] and heading [rad] of the centre of lane ``number`` at ``s``.
 
         Args:
-            number: of the lane.
+            number: number of the lane.
             s: along the road [m].
-            offset: to the left of the reference line's direction [m].
+            offset: offset to the left of the reference line's direction [m].
 
         Raises:
-            SceneError: the road has no such lane there.
+            SceneError: the road has no lane ``number`` at ``s``.
         """
         return self.at(s, self.lane(number, s).centre_t(s) + offset)
 
@@ -175,7 +175,7 @@ class Road:
         return (number < 0) == self.drives_right
 
     def project(self, x: float, y: float) -> tuple[float, float]:
-        """(s, t) [m] of the place on the road that is nearest to (x, y) seen from above."""
+        """(s, t) [m] of the position on the road nearest to (x, y), seen from above."""
         a, b = self.points[:-1, :2], self.points[1:, :2]
         d = b - a
         u = np.clip((([x, y] - a) * d).sum(axis=1) / np.maximum((d * d).sum(axis=1), 1e-12), 0, 1)
@@ -231,7 +231,7 @@ class LanePlace(NamedTuple):
         lane_id: the lane.
         s: arc length along its centre line, seen from above [m].
         offset: distance from it, positive to the left [m].
-        heading: of the lane there [rad].
+        heading: heading of the lane there [rad].
         inside: whether the position is between the lane's borders.
     """
 
@@ -312,7 +312,7 @@ class Lane:
         steps = np.linalg.norm(d, axis=1)
         if len(along) == 1:
             return np.array([along[0], along[0]])
-        # At a point the neighbours' directions count by the nearness of their middles.
+        # The direction at a point is the mean of its segments, weighted by inverse length.
         between = (along[:-1] * steps[1:] + along[1:] * steps[:-1]) / (steps[:-1] + steps[1:])
         ends = np.array([2 * along[0] - between[0], 2 * along[-1] - between[-1]])
         return np.concatenate([ends[:1], between, ends[1:]])
@@ -403,8 +403,8 @@ class Signal:
         position: x, y, z in the world [m].
         heading: direction that its face looks in [rad].
         lanes: controlled lanes.
-        stop_line: of their traffic; None: at the lanes' ends.
-        value: of a speed limit [m/s], else None.
+        stop_line: stop line of their traffic; None for the ends of the lanes.
+        value: value of a speed limit [m/s], else None.
     """
 
     signal_id: str

@@ -28,7 +28,7 @@ It separates lanes of both directions at one position, without favouring adjacen
 
 @func
 def cell_of(frame: Any, columns: int, rows: int, x: float, y: float) -> Any:
-    """Cell of a place, clamped into the grid of ``frame`` (x0, y0, edge)."""
+    """Cell of a position, clamped to the grid of ``frame`` (x0, y0, edge)."""
     i = min(max(math.floor((x - frame[0]) / frame[2]), 0), columns - 1)
     j = min(max(math.floor((y - frame[1]) / frame[2]), 0), rows - 1)
     return i, j
@@ -52,8 +52,8 @@ def on_segment(segments: Any, k: int, x: float, y: float) -> Any:
 def nearest_segment(grid: Any, segments: Any, lane_of: Any, allowed: Any, place: Any) -> Any:
     """Segment of an allowed lane with the lowest cost, or -1; fraction along it, signed distance.
 
-    The heading of ``place`` (x, y, heading) may be NaN: then only the distance counts. Cells are
-    visited in rings, until no farther one can contain anything nearer.
+    If the heading of ``place`` (x, y, heading) is NaN, only the distance counts. Cells are visited
+    in rings, until no farther cell can contain a nearer segment.
     """
     x, y, heading = place
     first, entries, frame, columns, rows = grid
@@ -132,7 +132,7 @@ def in_polygon(points: Any, start: int, stop: int, x: float, y: float) -> bool:
 
 @kernel
 def inside_any(table: Any, allowed: Any, outlines: Any, places: Any, found: Any) -> None:
-    """Which positions [S, 2] are on an allowed lane or inside one of the outlines.
+    """Mask of the positions [S, 2] on an allowed lane or inside one of the outlines.
 
     Args:
         table: (grid, quads, lane_of) with borders of each segment [K, 4, 2] float64 [m].
@@ -163,8 +163,8 @@ def inside_any(table: Any, allowed: Any, outlines: Any, places: Any, found: Any)
 
 @kernel
 def count_cells(boxes: Any, frame: Any, columns: int, rows: int) -> Any:
-    """How many of the boxes [K, 4] (low x, y, high x, y) touch each cell, as first places of a
-    list by cell [columns * rows + 1]."""
+    """Offsets [columns * rows + 1] of each cell in a list of the boxes [K, 4] (low x, y, high x, y)
+    that touch it."""
     first = np.zeros(columns * rows + 1, np.int64)
     for k in range(len(boxes)):
         i0, j0 = cell_of(frame, columns, rows, boxes[k, 0], boxes[k, 1])
@@ -179,7 +179,7 @@ def count_cells(boxes: Any, frame: Any, columns: int, rows: int) -> Any:
 
 @kernel
 def fill_cells(boxes: Any, frame: Any, columns: int, rows: int, first: Any) -> Any:
-    """The list that :func:`count_cells` has counted: boxes by cell, each cell's in order."""
+    """The list of boxes by cell at the offsets of :func:`count_cells`, in order within a cell."""
     entries = np.empty(first[-1], np.int32)
     fill = first[:-1].copy()
     for k in range(len(boxes)):
@@ -200,7 +200,7 @@ MAX_SEGMENT_M = 20.0
 
 
 class LaneIndex:
-    """Segments of all lanes in arrays, and a grid over them, as kernels take them."""
+    """Segments of all lanes in arrays, and a grid over them, as inputs of the kernels."""
 
     def __init__(self, lanes: tuple[Lane, ...]) -> None:
         self.lanes = lanes
@@ -213,7 +213,7 @@ class LaneIndex:
         self.grid = self._grid()
 
     def of_kinds(self, kinds: Iterable[str]) -> NDArray[np.bool_]:
-        """Which lanes are of these kinds, [L] bool."""
+        """Mask of the lanes of these kinds, [L] bool."""
         wanted = frozenset(kinds)
         known = self._of_kinds.get(wanted)
         if known is None:
@@ -226,7 +226,7 @@ class LaneIndex:
         return {}
 
     def _grid(self) -> tuple[NDArray[np.int64], NDArray[np.int32], Float, int, int]:
-        """Segments by cell: of every cell that the rectangle around their rims touches."""
+        """Segments by cell: all whose bounding rectangles touch the cell."""
         ends = self.segments[:, :4].reshape(-1, 2, 2)
         corners = np.concatenate([self.quads, ends], axis=1)
         boxes = np.concatenate([corners.min(axis=1), corners.max(axis=1)], axis=1)
@@ -244,8 +244,8 @@ class LaneIndex:
 
 
 def _segments(lane: Lane) -> tuple[Float, Float]:
-    """Segments [K, 7] (both ends, heading, arc length at both) and rims [K, 4, 2] of a lane, none
-    longer than a few cells."""
+    """Segments [K, 7] (both ends, heading, arc length at both) and borders [K, 4, 2] of a lane,
+    each at most a few cells long."""
     left, right = lane.rims
     s = lane.s
     longest = np.diff(s).max()
@@ -313,7 +313,7 @@ class LaneGraph:
         """A graph of parts, stored by their ids.
 
         Args:
-            lanes: of the graph.
+            lanes: lanes of the graph.
             **parts: iterables ``areas``, ``stop_lines``, ``signals``, ``roads``; and ``source``,
                 ``accuracy``, ``geo_reference``.
 
@@ -353,7 +353,7 @@ class LaneGraph:
         """The lane with that id.
 
         Raises:
-            SceneError: there is none.
+            SceneError: the lane does not exist.
         """
         try:
             return self.lanes[lane_id]
@@ -364,7 +364,7 @@ class LaneGraph:
         """The road with that id.
 
         Raises:
-            SceneError: there is none; only maps in OpenDRIVE have roads.
+            SceneError: the road does not exist; only OpenDRIVE maps have roads.
         """
         try:
             return self.roads[road_id]
@@ -400,7 +400,7 @@ class LaneGraph:
         Args:
             x, y: world position [m].
             heading: preferred direction of the lane [rad]; None: any direction.
-            kinds: of lanes to consider.
+            kinds: kinds of lanes to consider.
             within: maximum distance from a centre line [m].
         """
         place = np.array([[x, y, math.nan if heading is None else heading]])
@@ -454,9 +454,9 @@ class LaneGraph:
 
         Args:
             lane_id: first lane.
-            length: of each route, unless its lanes end before [m].
+            length: length of each route, unless its lanes end before [m].
             s: start on the first lane [m].
-            limit: maximum number of routes; the first ones found.
+            limit: maximum number of routes, in order of discovery.
 
         Raises:
             SceneError: there is no such lane.
@@ -476,11 +476,11 @@ class LaneGraph:
         return found
 
     def route(self, start: str, goal: str, *, change_cost: float = 20.0) -> tuple[str, ...] | None:
-        """The shortest route from one lane to another, or None.
+        """The shortest route from one lane to another; None if there is no route.
 
         Args:
             start, goal: lanes.
-            change_cost: of a lane change to a neighbour of the same direction [m].
+            change_cost: cost of a lane change to a neighbour of the same direction [m].
 
         Raises:
             SceneError: there is no such lane.
@@ -540,7 +540,7 @@ class LaneGraph:
         return lanes + areas + roads
 
     def moved(self, yaw: float, shift: ArrayLike) -> LaneGraph:
-        """The graph turned about the z axis by ``yaw`` [rad], then moved by ``shift`` [3] [m]."""
+        """The graph rotated about the z axis by ``yaw`` [rad], then moved by ``shift`` [3] [m]."""
         by = np.array(shift, dtype=np.float64)
         lines = {
             k: replace(v, points=turned(v.points, yaw) + by) for k, v in self.stop_lines.items()

@@ -1,9 +1,9 @@
 """Lenses other than the pinhole: maps between directions and points of the image plane.
 
 A lens maps directions of the camera frame (x right, y down, z forward) to a plane of focal length
-one, and the camera's ``K`` maps the plane to pixels. So a lens is independent of the image size and
-does not change when the camera is resized. Formulas are those of OpenCV 4 (``projectPoints``,
-``fisheye``, ``omnidir``) and of NVIDIA's f-theta model, in float64.
+one, and the camera's ``K`` maps the plane to pixels. A lens is therefore independent of the image
+size. Formulas are those of OpenCV 4 (``projectPoints``, ``fisheye``, ``omnidir``) and of NVIDIA's
+f-theta model, in float64.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ ROUNDS = 40
 """Maximum iterations of Newton's method; it stops at convergence."""
 CONVERGED = 1e-12
 SAMPLES = 2048
-"""Samples in the search for the end of a radius's growth."""
+"""Number of samples in the search for the maximum of a radius."""
 FLATTEST = math.tan(math.radians(89.0))
-"""No perspective lens looks farther from its axis than this distance on the plane."""
+"""Maximum distance from the axis on the plane for perspective lenses."""
 OPENING = math.pi
-"""No lens looks farther from its axis than this [rad]."""
+"""Maximum angle from the axis for all lenses [rad]."""
 
 
 class Lens(Protocol):
@@ -518,7 +518,7 @@ def _inverted(
 
 
 def _growing(model: str, slope_of: Callable[[Float], Float], limit: float) -> float:
-    """Up to where in [0, limit] a slope is positive."""
+    """Position in [0, limit] up to which a slope is positive."""
     at = np.linspace(0.0, limit, SAMPLES)
     grows = slope_of(at) > 0
     if grows.all():
@@ -532,7 +532,7 @@ def _growing(model: str, slope_of: Callable[[Float], Float], limit: float) -> fl
 
 
 def _last_true(holds: Callable[[float], bool], low: float, high: float) -> float:
-    """Largest number in [low, high] that holds, where it holds at ``low``."""
+    """Largest number in [low, high] for which the condition holds; it must hold at ``low``."""
     if holds(high):
         return high
     for _ in range(60):

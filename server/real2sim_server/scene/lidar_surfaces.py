@@ -1,7 +1,7 @@
 """Gaussians that only LiDARs see, with a reflectivity each.
 
-Images and LiDAR ask different things of Gaussians: those trained on images alone are haze to a
-beam. So a scene may hold a second set, made of the recorded sweeps, that only LiDARs look at.
+Gaussians trained on images alone are haze to a beam. A scene can therefore contain a second set,
+made from the recorded sweeps and visible to LiDARs only.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Reflector:
     """Gaussians as a LiDAR sees them.
 
     Attributes:
-        cloud: in the frame of the background or of the object.
+        cloud: cloud in the frame of the background or of the object.
         attributes: [N, 2] float32: reflectivity at normal incidence, 0 to MAX_REFLECTIVITY, and
             share of lost rays, 0 to 1.
 
@@ -69,14 +69,14 @@ class Reflector:
 
 @dataclass(frozen=True, eq=False)
 class RingResponse:
-    """How the sensor that recorded a log answers to reflectivity, ring by ring and by range.
+    """Response of the recording sensor to reflectivity, by ring and range.
 
-    Lasers of one sensor differ, and none is calibrated at every range. What a recorded intensity
-    is of the reflectivity there: ``gain * reflectivity + offset``.
+    The lasers of a sensor differ, and their calibration varies with the range. A recorded intensity
+    is ``gain * reflectivity + offset``.
 
     Attributes:
         elevation: [B] of the rings, as the scan lists them [rad].
-        gain, offset: [B, K] between RANGE_STEPS.
+        gain, offset: [B, K], one column per interval of RANGE_STEPS.
 
     Raises:
         SceneError: shapes that differ, or values that are not finite.
@@ -137,11 +137,11 @@ class LidarSurfaces:
     """The second set of Gaussians of a scene, for LiDARs.
 
     Attributes:
-        background: in the world.
+        background: background in the world frame.
         objects: by object id, in the object's frame; a missing object shows its own Gaussians.
         incidence: share of reflected light that is independent of the incidence, 0 to 1; the rest
             is proportional to the cosine.
-        response: of the sensor that recorded the log, if its scans have rings.
+        response: response of the sensor that recorded the log, if its scans have rings.
 
     Raises:
         SceneError: a share outside 0 to 1.
@@ -164,11 +164,11 @@ class LidarSurfaces:
 
     @property
     def gaussian_count(self) -> int:
-        """Gaussians of all."""
+        """Number of Gaussians in background and objects."""
         return len(self.background.cloud) + sum(len(o.cloud) for o in self.objects.values())
 
     @property
     def nbytes(self) -> int:
-        """Memory of all [bytes]."""
+        """Memory of the set [bytes]."""
         parts = [self.background, *self.objects.values()]
         return sum(p.cloud.nbytes + 8 * len(p.cloud) for p in parts)

@@ -99,7 +99,7 @@ class Beams:
             columns: azimuth steps of a sweep, C.
             rate_hz: turns per second; a sweep takes a whole turn.
             azimuth_offset: [B] or one number, of the rows relative to the column's azimuth [rad].
-            clockwise: seen from above.
+            clockwise: whether the sensor rotates clockwise seen from above.
             start: azimuth of the first column [rad].
             field_of_view: azimuth range of the columns [rad]; less than a turn is centred on the
                 middle of the turn. The time stamp of a sweep is the middle of the turn.
@@ -194,7 +194,7 @@ class Lidar:
         name: unique on its vehicle.
         beams: directions and times of the rays.
         T_vehicle_lidar: [4, 4] float64, sensor frame x forward, y left, z up.
-        min_range, max_range: of returns [m]; nearer surfaces are invisible and occlude nothing.
+        min_range, max_range: range of returns [m]; nearer surfaces are invisible and transparent.
         divergence: (horizontal, vertical) full angle of a beam at 1/e^2 of its power [rad]; its
             standard deviation on a surface is a quarter of its diameter there.
         returns: 1 (the median of the light), 2 (first and last) or 3 (and the strongest).
@@ -251,7 +251,7 @@ class Lidar:
 
 
 def wrapped(angle: Float) -> Float:
-    """Angles [rad] brought to [-pi, pi)."""
+    """Angles [rad] wrapped to [-pi, pi)."""
     turned: Float = (np.asarray(angle, dtype=np.float64) + np.pi) % (2 * np.pi) - np.pi
     return turned
 
@@ -280,7 +280,7 @@ def catalogue_lidar(name: str) -> Lidar:
     """The LiDAR of that name in the catalogue.
 
     Raises:
-        LidarError: with the names there are.
+        LidarError: the name is unknown; the message lists the known ones.
     """
     if name not in lidar_names():
         known = ", ".join(lidar_names())
@@ -301,7 +301,7 @@ def read_lidar(path: str | PathLike[str]) -> Lidar:
     """The LiDAR of a JSON file.
 
     Raises:
-        LidarError: the file is missing, too large, or not a LiDAR; with the location and reason.
+        LidarError: the file is missing, too large, or not a LiDAR; gives the location and reason.
     """
     file = Path(path)
     try:
@@ -322,7 +322,7 @@ def lidar_from_values(values: Any) -> Lidar:
     """The LiDAR of JSON values.
 
     Raises:
-        LidarError: with the first fields that are wrong, and why.
+        LidarError: names the first invalid fields and the reasons.
     """
     try:
         model = TypeAdapter(LidarModel).validate_python(values)
@@ -461,7 +461,7 @@ RADARS: Mapping[str, RadarModel] = {
         ray_spacing_deg=0.3,
     ),
 }
-"""Four kinds of 77 GHz radars with typical orders of magnitude; not a maker's figures."""
+"""Four kinds of 77 GHz radars with typical orders of magnitude, not data of a manufacturer."""
 
 RADAR_MOUNT = (3.6, 0.0, 0.5)
 """Default position of radars, from the vehicle's rear axle [m]."""
@@ -534,7 +534,7 @@ class Radar:
 
     @property
     def solid_angle(self) -> float:
-        """That of one ray on the axis [sr]."""
+        """Solid angle of one ray on the axis [sr]."""
         wide, high = (
             np.radians(angle) / count
             for angle, count in zip(

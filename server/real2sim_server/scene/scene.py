@@ -72,7 +72,7 @@ class Sky:
         return sum(t.numel() * t.element_size() for t in self.tensors().values())
 
     def tensors(self) -> dict[str, Tensor]:
-        """Its tensors by name, without absent ones."""
+        """The tensors by name, without absent ones."""
         known = {} if self.uncertainties is None else {"uncertainties": self.uncertainties}
         return {"faces": self.faces, **known}
 
@@ -184,7 +184,7 @@ class SceneObject:
         cloud: Gaussians in the object frame: origin at the box centre, x forward, z up.
         trajectory: ``T_world_object`` over time; the object exists only in its range.
         colour: change of the cloud's colour over time, or None; see :meth:`cloud_at`.
-        figure: of a walking person, with ``cloud`` in the rest pose; or None.
+        figure: figure of a walking person, with ``cloud`` in the rest pose; or None.
 
     Raises:
         SceneError: an invalid size, or a colour or figure with another number of Gaussians.
@@ -262,7 +262,7 @@ class Scene:
         content_hash: SHA-256 of the bundle on disk; empty if not saved.
         stored_ground: fitted by the reconstruction, or None. Use :attr:`ground` instead.
         lidar: Gaussians for LiDARs, or None: LiDARs see the same Gaussians as cameras.
-        lanes: of its roads, from a map or the log, or None.
+        lanes: lanes of its roads, from a map or the log, or None.
     """
 
     name: str
@@ -294,10 +294,10 @@ class Scene:
         object.__setattr__(self, "provenance", MappingProxyType(dict(self.provenance)))
 
     def object(self, object_id: str) -> SceneObject:
-        """The object of that id.
+        """The object with that id.
 
         Raises:
-            UnknownObjectError: with the ids there are.
+            UnknownObjectError: the id is unknown; the message lists the known ones.
         """
         try:
             return self.objects[object_id]

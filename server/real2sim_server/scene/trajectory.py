@@ -83,7 +83,7 @@ class Trajectory:
         """Build from ``T_fixed_moving`` [T, 4, 4].
 
         Raises:
-            SceneError: for a matrix that is not a rigid transform, with its place, and as above.
+            SceneError: a matrix is not a rigid transform (the message names it), or as above.
         """
         t = np.asarray(transforms, dtype=np.float64)
         if t.ndim != 3 or t.shape[1:] != (4, 4):

@@ -1,6 +1,6 @@
 """Synthetic drives: a procedural street, ray-cast on the CPU, with ground truth.
 
-It shares no code with the renderer of Gaussians, so that it can be its judge.
+This package shares no code with the Gaussian renderer, so that it can serve as a reference for it.
 """
 
 from .log import SyntheticLog, generate_log, synthesize

@@ -104,7 +104,7 @@ def refit(
             normals[row, axis] = vertex_normals[a, axis]
             normals[row, 3 + axis] = vertex_normals[b, axis]
             normals[row, 6 + axis] = vertex_normals[c, axis]
-    # Children come behind their node.
+    # Children come after their node.
     for node in range(end - 1, start - 1, -1):
         child, count = int(children[node]), int(counts[node])
         for axis in range(3):
@@ -290,13 +290,13 @@ def cast_mesh(  # noqa: PLR0912, PLR0915 - one loop; parting it costs a call per
 ):
     """Nearest hit below ``root``: (distance, triangle, u, v), triangle -1 without a hit.
 
-    With ``any_hit`` the first hit found. Moeller and Trumbore, "Fast, minimum storage ray/triangle
-    intersection", 1997.
+    With ``any_hit``, returns the first hit found. Source: Moeller and Trumbore, "Fast, minimum
+    storage ray/triangle intersection", 1997.
     """
     nodes, entries = stack
     ix, iy, iz = _inverse(dx), _inverse(dy), _inverse(dz)
     best, best_triangle, best_u, best_v = limit, np.int64(-1), 0.0, 0.0
-    # Unsigned indices spare the test for negative ones at every access.
+    # Unsigned indices avoid a test for negative ones at every access.
     node = np.uint32(root)
     if _enter(bounds, node, ox, oy, oz, ix, iy, iz, best) == np.inf:
         return best, best_triangle, best_u, best_v
@@ -352,7 +352,7 @@ def cast_mesh(  # noqa: PLR0912, PLR0915 - one loop; parting it costs a call per
 
 @func(forceinline=True)
 def _near_instance(instances, i, ox, oy, oz, dx, dy, dz, limit):
-    """Whether a ray comes close enough to instance i for its mesh to be looked at."""
+    """Whether a ray intersects the bounding sphere of instance i."""
     cx = instances.to_world[i, 0, 3] - ox
     cy = instances.to_world[i, 1, 3] - oy
     cz = instances.to_world[i, 2, 3] - oz

@@ -1,7 +1,7 @@
-"""A procedural street of Gaussians to measure the renderer on.
+"""A procedural street of Gaussians for benchmarks of the renderer.
 
-Made like a street that was initialised from LiDAR: one disc for every occupied voxel of 0.15 m,
-flat along its surface and overlapping its neighbours, with noise in place, size and colour.
+It resembles a street initialised from LiDAR: one disc per occupied voxel of 0.15 m, flat along the
+surface and overlapping its neighbours, with noise in position, size and colour.
 """
 
 from __future__ import annotations
@@ -45,19 +45,19 @@ class StreetScene:
 
     @property
     def gaussian_count(self) -> int:
-        """Gaussians drawn; clouds that are shared count for each instance."""
+        """Number of rendered Gaussians; shared clouds count once per instance."""
         return sum(len(instance.cloud) for instance in self.instances)
 
 
 def street_scene(
     count: int = 1_000_000, *, width: int = 960, height: int = 640, seed: int = 0
 ) -> StreetScene:
-    """A straight street along x with exactly ``count`` Gaussians, cars among them.
+    """A straight street along x with exactly ``count`` Gaussians, including cars.
 
     Args:
         count: at least 100,000; a larger number makes the street longer.
-        width, height: of the camera [px]; its horizontal field of view is 56 degrees.
-        seed: of all noise.
+        width, height: image size of the camera [px]; its horizontal field of view is 56 degrees.
+        seed: seed of all noise.
     """
     rng = np.random.default_rng(seed)
     car = surfels_to_cloud(car_surfels(rng), rng)
@@ -135,7 +135,7 @@ def tree(rng: np.random.Generator, foot: Float) -> StreetSurfels:
 
 
 def car_surfels(rng: np.random.Generator) -> StreetSurfels:
-    """The shell of a car about its own centre: five sides of a body and of a cabin."""
+    """The shell of a car, with the origin at its centre: five sides of a body and of a cabin."""
     body = shell(np.array([0, 0, -0.25]), CAR_SIZE * (1, 1, 0.6))
     cabin = shell(np.array([-0.2, 0, 0.45]), CAR_SIZE * (0.5, 0.85, 0.4))
     return joined(
@@ -144,7 +144,7 @@ def car_surfels(rng: np.random.Generator) -> StreetSurfels:
 
 
 def shell(centre: Float, size: Float) -> StreetSurfels:
-    """All sides but the lower one of a box."""
+    """All sides of a box except the bottom."""
     low, (a, b, c) = centre - size / 2, np.diag(size)
     return joined(
         [
@@ -158,7 +158,7 @@ def shell(centre: Float, size: Float) -> StreetSurfels:
 
 
 def parked_cars(car: GaussianCloud, length: float) -> list[Instance]:
-    """The same cloud at both kerbs, some of them turned round."""
+    """Instances of one cloud at both kerbs, some in the opposite direction."""
     places = np.linspace(4, min(length - 20, 120), CARS // 2)
     instances = []
     for index in range(CARS):
@@ -190,7 +190,7 @@ def painted(
 
 
 def joined(parts: list[StreetSurfels]) -> StreetSurfels:
-    """All discs in one."""
+    """All discs concatenated."""
     columns = zip(*(vars(part).values() for part in parts), strict=True)
     return StreetSurfels(*(np.concatenate(column) for column in columns))
 
@@ -225,7 +225,7 @@ def unit(vectors: Float) -> Float:
     return scaled
 
 
-# The street as a scene that can be driven through.
+# The street as a scene with a drive.
 
 SPEED = 8.0
 SECONDS = 20
@@ -236,9 +236,9 @@ def street(name: str, *, gaussians: int, width: int, height: int) -> Scene:
     """A straight street with parked cars; the ego drives along it at 8 m/s for 20 s.
 
     Args:
-        name: of the scene.
-        gaussians: in all, parked cars included.
-        width, height: of its one camera, ``front`` [px].
+        name: name of the scene.
+        gaussians: total number, including parked cars.
+        width, height: image size of its only camera, ``front`` [px].
     """
     made = street_scene(gaussians, width=width, height=height)
     times = np.arange(0, SECONDS * 1_000_000 + 1, PERIOD_US)

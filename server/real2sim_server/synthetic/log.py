@@ -53,7 +53,7 @@ class SyntheticLog(DrivingLog):
             T_world_camera: [4, 4], OpenCV camera frame.
             k: [3, 3] intrinsics [px], pixel centres at +0.5.
             width, height: image size [px].
-            t_us: time [us]; outside the drive vehicles move straight on.
+            t_us: time [us]; outside the drive, vehicles continue straight ahead.
 
         Returns:
             RGB uint8 [H, W, 3]; depth float32 [H, W] along the camera's z [m], 0 in the sky;
@@ -108,13 +108,13 @@ class SyntheticLog(DrivingLog):
 
         Args:
             camera: lens, shutter, K and size.
-            motion: of the camera over the read-out.
-            t_us: time of the middle of the read-out.
+            motion: motion of the camera over the read-out.
+            t_us: time of the middle of the read-out [us].
             samples: rays per pixel along each image axis.
 
         Returns:
             RGB uint8 [H, W, 3]; distance from the camera float32 [H, W] [m], mean over a pixel's
-            rays, 0 where any of them meets the sky. Both are 0 where the lens sees nothing.
+            rays, 0 where any of them hits the sky. Both are 0 outside the lens's field of view.
         """
         source = self.source
         assert isinstance(source, SyntheticSource)
@@ -151,7 +151,7 @@ class SyntheticLog(DrivingLog):
         Args:
             T_world_camera, T_world_next: [4, 4], camera poses in both.
             k, width, height: as in :meth:`render`.
-            times_us: of both.
+            times_us: times of both [us].
 
         Returns:
             [H, W, 2] float32, motion of the surface at a pixel's centre [px], even if it is then
@@ -166,7 +166,7 @@ class SyntheticLog(DrivingLog):
         """The true sweep of a LiDAR on the vehicle about ``t_us`` [us], without noise or losses.
 
         Args:
-            lidar: with [B, C] rays and one time per column.
+            lidar: LiDAR with [B, C] rays and one time per column.
             t_us: time stamp of the sweep.
 
         Returns:
@@ -179,16 +179,16 @@ class SyntheticLog(DrivingLog):
 
 @dataclass(frozen=True, eq=False)
 class SyntheticSource:
-    """Casts the rays of a synthetic drive.
+    """Ray caster of a synthetic drive.
 
     Attributes:
-        config: of the drive.
+        config: configuration of the drive.
         world: surroundings and vehicle shapes.
         drive: vehicles, then people, in the order of the log's tracks.
         roots: node [S] of each vehicle shape's mesh.
         body_paints: row [I] of each vehicle's body in the paint table.
         rig: as in the log.
-        people: in the world's arrays; None where there are none.
+        people: in the world's arrays; None without people.
     """
 
     config: SyntheticConfig
@@ -328,7 +328,7 @@ class SyntheticSource:
             root=people.roots(),
             shape=np.zeros(len(every), np.int64),
             paint=np.zeros(len(every), np.int64),
-            # What darkens the ground about them is their feet, not their box.
+            # Their feet darken the ground around them, not their box.
             half_size=np.column_stack([np.full((len(every), 2), 0.1), half[:, 2]]),
         )
 
@@ -450,7 +450,7 @@ def _sweep(points: Float, intensity: ArrayLike, offsets_us: ArrayLike) -> LidarS
 
 
 def generate_log(config: SyntheticConfig) -> SyntheticLog:
-    """The drive of ``config``; builds the world now, casts images on demand."""
+    """The drive of ``config``. Builds the world immediately, casts images on demand."""
     drive = plan_drive(config)
     paints: list[tuple[float, ...]] = []
     house_rng = np.random.default_rng([config.seed, 2])
@@ -512,7 +512,7 @@ def synthesize(
     """Generate a drive and write it in the native layout to the new folder ``out``.
 
     Args:
-        config: of the drive.
+        config: configuration of the drive.
         out: a folder that is new or empty.
         on_progress: called with (done, total) after each image and each sweep.
 

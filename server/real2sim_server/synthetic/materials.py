@@ -15,7 +15,7 @@ import numpy as np
 
 from .._numba import func
 
-# Hash noise for textures, faded where it is finer than a pixel.
+# Hash noise for textures, faded out below the size of a pixel.
 
 _MASK = 0xFFFFFFFF
 _RNG = np.random.default_rng(20240229)
@@ -36,7 +36,7 @@ def hash01(x, y, seed):
 def value_noise(x, y, seed):
     """Smooth noise in [0, 1] with features of size 1, of period 256.
 
-    Perlin's permutation table: an integer hash at every corner took most of a picture's time.
+    Uses Perlin's permutation table, which is much faster than an integer hash at every corner.
     """
     fx, fy = math.floor(x), math.floor(y)
     u, v = x - fx, y - fy
@@ -94,17 +94,17 @@ ROAD, KERB_STONE, PAVING, EARTH, WALL, WINDOW, DOOR, ROOF = range(8)
 PLAIN, BARK, LEAVES, SIGN, BODY, WHEEL = range(8, 14)
 
 PARKING_BAY = 6.5
-"""Distance of the marks between parking bays [m]."""
+"""Spacing of the marks between parking bays [m]."""
 
 
 @func(fastmath=True)
 def static_surface(  # noqa: PLR0911 - one return per material
     material, paint, p, u, v, fu, fv, seed
 ):
-    """(r, g, b, gloss) of any material but bodies and wheels of vehicles.
+    """(r, g, b, gloss) of all materials except bodies and wheels of vehicles.
 
     ``u, v`` are texture coordinates [m], ``fu, fv`` a pixel's size along them [m], ``p`` a
-    row of the paint table. Rows are not sliced off: that counts references, across all threads.
+    row of the paint table. Rows are not sliced, because reference counting is slow with threads.
     """
     f = math.sqrt(fu * fv)
     if material == ROAD:
@@ -367,9 +367,9 @@ def body_surface(shape, roof, i, paint, p, number, x, y, z, nx, ny, f):
         roof: table of roof lines, heights at even steps from rear to front [m].
         i: row of both.
         paint, p: paint table and the row of the body's colour.
-        number: of the vehicle, for its plates.
+        number: number of the vehicle, for its plates.
         x, y, z: the point; z from the ground [m].
-        nx, ny: of the surface normal.
+        nx, ny: components of the surface normal.
         f: size of a pixel there [m].
     """
     length, height, belt = shape[i, 0], shape[i, 2], shape[i, 3]
@@ -514,7 +514,7 @@ def _plate(r, g, b, y, z, number, f):
     glyph = 1.0 if hash01(column, row, 400 + number) < 0.55 else 0.0
     if int(column) % 4 == 3:
         glyph = 0.0
-    # Below two pixels a stroke the letters melt into grey.
+    # Below two pixels per stroke, the letters blend into grey.
     sharp = min(max((0.02 - f) / 0.012, 0.0), 1.0)
     shade = 0.72 * (1.0 - ink * blend(0.4, 0.95 * glyph, sharp))
     return blend(r, shade, plate), blend(g, shade, plate), blend(b, shade * 0.97, plate)

@@ -41,7 +41,7 @@ class MeshBuilder:
     _quads: list[tuple[object, object, int, int]] = field(default_factory=list)
 
     def mix(self, *values: float) -> int:
-        """Add a row to the paint table: red, green, blue (linear), then the material's own."""
+        """Add a row to the paint table: red, green, blue (linear), then values of the material."""
         self.paints.append((*values, *([0.0] * (PAINT_WIDTH - len(values)))))
         return len(self.paints) - 1
 

@@ -1,4 +1,4 @@
-"""People as ray-cast meshes, refitted at every instant, and their ground truth."""
+"""People as ray-cast meshes, refitted for every instant, and their ground truth."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class PersonMesh:
 class PeopleCast:
     """The people of a street in the arrays for ray casting.
 
-    The arrays change with time, so whoever casts holds them by :meth:`at`.
+    The arrays change with time: cast rays only inside the context of :meth:`at`.
     """
 
     world: RaycastWorld
@@ -200,7 +200,7 @@ def trace_flow(  # noqa: PLR0917 - two views of one world
     size: tuple[int, int],
     then: float,
 ) -> NDArray[np.float32]:
-    """Flow [H, W, 2] [px] from the first pose to the second, where people are at ``then`` [s]."""
+    """Flow [H, W, 2] [px] from the first pose to the second, with people as at ``then`` [s]."""
     triangle, instance, place = _trace(world, places[0], poses[0], k, size)
     width, height = size
     v, u = np.mgrid[:height, :width].reshape(2, -1) + 0.5

@@ -29,7 +29,7 @@ from .materials import (
 # Light of sun and sky.
 
 SUN = (-0.52, 0.36, 0.775)
-"""Direction to the sun, nearly unit: behind the drive's left shoulder, 51 degrees high."""
+"""Direction to the sun, nearly unit: left and behind the direction of travel, 51 degrees high."""
 
 _NORM = math.sqrt(sum(c * c for c in SUN))
 SUN_X, SUN_Y, SUN_Z = (c / _NORM for c in SUN)
@@ -102,7 +102,7 @@ class RaycastWorld(NamedTuple):
         paints: [P, 8] paint table.
         shapes: [S, 16] measures of vehicle shapes.
         roofs: [S, n] their roof lines [m].
-        seed: of the textures.
+        seed: seed of the textures.
     """
 
     bounds: Float
@@ -221,7 +221,7 @@ def ray_colour(world, instances, hit, ox, oy, oz, dx, dy, dz, spread, stack):
     """Shade a ray with a known nearest hit: linear (r, g, b), key, normal and plane offset.
 
     The key identifies the surface and whether it is in the sun. Neighbouring pixels with equal
-    keys, normals and offsets need only one sample each. Negative keys always need more.
+    keys, normals and offsets need only one sample each. Negative keys always need more samples.
     """
     t, k, _, _, instance = hit
     if k < 0:
@@ -234,13 +234,13 @@ def ray_colour(world, instances, hit, ox, oy, oz, dx, dy, dz, spread, stack):
     facing = nx * SUN_X + ny * SUN_Y + nz * SUN_Z
     leaves = world.material[k] == LEAVES
     if leaves:
-        # Leaves let light through: their far side is dim, not black.
+        # Leaves transmit light: their far side is dim, not black.
         facing = 0.35 + 0.65 * facing
     elif gx * SUN_X + gy * SUN_Y + gz * SUN_Z <= 0.0:
         facing = 0.0
     lit = 0.0
     if facing > 0.0:
-        # A smooth body of flat triangles would shade itself near its silhouette.
+        # Avoid self-shadowing of smooth bodies near their silhouettes.
         lift = 0.012 if instance >= 0 else 0.004
         if leaves:
             lift = 0.25
@@ -370,8 +370,8 @@ def shoot_image(
 def _sheared_grid(samples: int) -> Float:
     """Sample positions [samples^2, 2] relative to a pixel's centre.
 
-    No two share a row or a column, which gives the best antialiasing of horizontal and vertical
-    edges. The same pattern in every pixel adds no grain.
+    No two samples share a row or column, for the best antialiasing of horizontal and vertical
+    edges. Every pixel uses the same pattern, which avoids grain.
     """
     j, i = np.divmod(np.arange(samples * samples), samples)
     x = (i + (j + 0.5) / samples) / samples
@@ -527,7 +527,7 @@ def shoot_lidar(world, sweeps, origins, directions, limit):
             s = surface_at(world, instances, hit, ox, oy, oz, dx, dy, dz, 0.002)
             brightness = 0.3 * s[0] + 0.5 * s[1] + 0.2 * s[2]
             facing = max(-(dx * s[4] + dy * s[5] + dz * s[6]), 0.0)
-            # Glass and lacquer send most of a beam away from the sensor.
+            # Glass and lacquer reflect most of a beam away from the sensor.
             diffuse = (1.0 - 0.6 * s[3]) * (0.25 + 0.75 * facing)
             ranges[c, b] = hit[0]
             returned[c, b] = min(1.25 * brightness * diffuse + 0.01, 1.0)

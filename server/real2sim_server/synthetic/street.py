@@ -30,7 +30,7 @@ class CameraSpec:
         name: unique on the rig.
         yaw: viewing direction about the vehicle's z axis [rad], 0 = ahead, positive = left.
         fov: horizontal field of view [rad].
-        position: in the vehicle frame [m].
+        position: position in the vehicle frame [m].
     """
 
     name: str
@@ -51,14 +51,14 @@ class SyntheticConfig:
     """Configuration of a synthetic drive; the same values give the same bits.
 
     Attributes:
-        seed: of all randomness: street, traffic, textures, LiDAR noise.
+        seed: seed of all randomness: street, traffic, textures, LiDAR noise.
         frames: number of frames.
         hz: frames per second, and turns of the LiDAR per second.
         width, height: image size of every camera [px].
         cameras: the rig.
         samples: rays per pixel along each image axis, at edges.
         moving_cars: number of moving vehicles, ahead of the ego vehicle and oncoming.
-        parked_cars: number of vehicles at the kerbs; fewer if the street has no room for more.
+        parked_cars: number of vehicles at the kerbs; fewer if the street has less room.
         speed: mean speed of the ego vehicle [m/s].
         lidar_beams, lidar_columns: beams, and azimuth steps per turn; 0 beams for no LiDAR.
         lidar_range: maximum range [m].

@@ -31,7 +31,7 @@ from .street import FACADE, KERB, KERB_HEIGHT, LANE, Street
 Corners = Float | Sequence[Sequence[float]]
 
 UV_PERIOD = 10.0
-"""Window textures count windows in multiples of this, so that each can differ."""
+"""Texture coordinates number windows in multiples of this, so that each can differ."""
 
 PLASTER, BRICK = 0.0, 1.0
 WALL_COLOURS = (
@@ -63,7 +63,7 @@ class House:
         shop: whether the ground floor is a shop.
         wall, trim, frame, roof, front: rows of the paint table.
         recess: depth of the windows behind the wall [m].
-        depth: of the house [m].
+        depth: depth of the house [m].
     """
 
     floors: int
@@ -110,7 +110,7 @@ def design_house(rng: np.random.Generator, builder: MeshBuilder) -> House:
 
 
 class Facade:
-    """Places flat pieces in a house's own axes: u along the front, w outwards, z up."""
+    """Places flat pieces in the axes of a house: u along the front, w outwards, z up."""
 
     def __init__(self, builder: MeshBuilder, start: ArrayLike, end: ArrayLike) -> None:
         """The front runs from ``start`` to ``end`` [2]; the street is to its right."""
@@ -414,7 +414,7 @@ def _add_tree(builder: MeshBuilder, at: Float, size: float, rng: np.random.Gener
 def _add_foliage(
     builder: MeshBuilder, centre: Float, radius: float, paint: int, rng: np.random.Generator
 ) -> None:
-    """A lump of leaves: a ball of loose quads, so that light and sky come through its rim."""
+    """A clump of leaves: a ball of loose quads with light and sky visible through its edge."""
     count = 230
     direction = rng.normal(size=(count, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
@@ -430,7 +430,7 @@ def _add_foliage(
         [at - size * first, at + size * second, at + size * first, at - size * second], axis=1
     )
     split = corners[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3, 3)
-    # Leaves are lit as the lump they belong to, not one by one: that is how crowns look.
+    # Leaves are lit like the clump that they belong to, which gives crowns their look.
     soft = direction * 0.8 + normal * 0.2
     soft /= np.linalg.norm(soft, axis=1, keepdims=True)
     normals = np.repeat(np.repeat(soft, 2, axis=0)[:, None], 3, axis=1)

@@ -47,7 +47,7 @@ ADULTS = (
 CHILDREN = ("girl", "boy", "small_girl", "small_boy")
 WOMEN = ("woman", "girl")
 HEIGHTS = {"tall_man": 1.92, "tall_woman": 1.8}
-"""Heights of builds whose default height is too large for their name [m]."""
+"""Heights of builds that are too tall by default [m]."""
 
 LOW, HIGH = 7.1, 8.5
 """Range of distances from the centre line for walking on a pavement [m]."""
@@ -122,10 +122,10 @@ def plan_people(
     """People and cyclists, in this order.
 
     Args:
-        config: of the drive.
+        config: configuration of the drive.
         street: its course.
         times_us: [F] frames [us].
-        traffic: path, length and width [m] of everything that drives or parks.
+        traffic: path, length and width [m] of all moving and parked vehicles.
     """
     if config.pedestrians + config.cyclists == 0:
         return ()
@@ -251,7 +251,7 @@ class _Planner:
         return s, d, np.full_like(s, KERB_HEIGHT), np.full_like(s, facing)
 
     def _cross(self, body: Body) -> Path:
-        """Across the crossing, after a moment at the kerb or already moving."""
+        """A walk over the crossing, after a moment at the kerb or already moving."""
         side = self.rng.choice([-1.0, 1.0])
         speed = self.rng.uniform(0.38, 0.5) * np.sqrt(9.81 * body.leg_length)
         begin = self.rng.uniform(-8.0, max(self.t[-1] - 1.0, -2.0))
@@ -261,7 +261,7 @@ class _Planner:
         return s, d, _pavement(d), np.full_like(s, -side * np.pi / 2)
 
     def _turn(self, body: Body) -> Path:
-        """Along the pavement, round a corner to the kerb, and a halt there."""
+        """A walk along the pavement and around a corner to the kerb, with a halt there."""
         side, way = self.rng.choice([-1.0, 1.0], 2)
         speed = self.rng.uniform(0.38, 0.48) * np.sqrt(9.81 * body.leg_length)
         lane, radius = self.rng.uniform(7.6, HIGH), 0.9
@@ -283,7 +283,7 @@ class _Planner:
         return np.column_stack([self.street.point(s, d), z])
 
     def _course(self, places: Float, known: Float) -> Float:
-        """Headings along places, where they move."""
+        """Headings along positions with motion."""
         if len(places) < 2:
             return known
         step = np.gradient(places[:, :2], axis=0)
@@ -358,7 +358,7 @@ def _is_female(body: Body) -> bool:
 
 
 def _picked(colours: tuple[Colour, ...], rng: np.random.Generator) -> Colour:
-    """One of some colours, a little lighter or darker."""
+    """A random colour of a list, slightly lighter or darker."""
     r, g, b = np.array(colours[rng.integers(len(colours))]) * rng.uniform(0.85, 1.15)
     return float(r), float(g), float(b)
 
@@ -411,7 +411,7 @@ class PlannedVehicle:
 
     Attributes:
         shape: index into ``vehicles.SHAPES``.
-        colour: of the body, linear RGB.
+        colour: colour of the body, linear RGB.
         trajectory: ``T_world_object`` of its box.
     """
 
@@ -507,7 +507,7 @@ def _drive_towards(
     speed = rng.uniform(0.8, 1.1) * config.speed
     start = rng.uniform(24, 32)
     for i in range(count):
-        # Every second one is large, so that trucks and buses are seen on short drives too.
+        # Every second vehicle is large, so that even short drives contain trucks and buses.
         shape = _pick(rng, longest=6.0) if i % 2 == 0 else _pick(rng, shortest=6.0)
         length = SHAPES[shape].size[0]
         start += length / 2
@@ -578,7 +578,7 @@ def _seconds(times_us: NDArray[np.int64]) -> Float:
 def poses_at(trajectory: Trajectory, times_us: Float) -> Float:
     """``T_fixed_moving`` [T, 4, 4] at any times [T] [us].
 
-    Between time stamps as in :class:`Trajectory`; outside, straight on with the velocity of the
+    Between time stamps as in :class:`Trajectory`; outside, straight ahead with the velocity of the
     nearest segment.
     """
     known = trajectory.times_us

@@ -17,7 +17,7 @@ from .materials import BODY, PLAIN, WHEEL
 from .mesh import Mesh, MeshBuilder
 
 PROFILE_SAMPLES = 96
-"""Samples of the roof line that the body's surface looks up."""
+"""Number of samples of the roof line for lookups by the body's surface."""
 CARGO_FLOOR = 1.0
 """Height of the box behind a cab over the ground [m]."""
 
@@ -27,16 +27,16 @@ class VehicleShape:
     """Measures of a body; lengths in metres, x from the middle, z from the ground.
 
     Attributes:
-        name: of the shape.
-        category: of the track.
+        name: name of the shape.
+        category: category of the track.
         size: (length, width, height).
         roof: (x / length, z / height) along the top, from rear to front.
         belt: height of the window sill.
         side_glass: x / length from and to.
         windscreen: x / length of its foot and its top edge.
-        rear_window: likewise; equal values for none.
+        rear_window: x / length of its foot and its top edge; equal values for none.
         axles: x / length of the rear and the front axle.
-        wheel_radius, clearance: of wheels, and below the sill.
+        wheel_radius, clearance: radius of the wheels, and clearance below the sill.
         pillars: number of pillars between the side windows.
         boxiness: exponent of the roof's cross-section, small for boxy.
         cargo: x / length from and to of a box behind the cab; equal values for none.
@@ -224,7 +224,7 @@ def _add_wheels(builder: MeshBuilder, shape: VehicleShape, black: int) -> None:
             steps = [(1.0, 0.24), (1.0, 0.03), (0.95, 0.0), (0.0, 0.0)]
             rings = np.array([centre + circle * radius * r - [0, side * d, 0] for r, d in steps])
             uv = np.array([circle[:, [0, 2]] * r for r, _ in steps])
-            # Each step is its own strip: a shared edge would round off the tyre's shoulder.
+            # Each step is a separate strip: a shared edge would round off the tyre's shoulder.
             for k in range(3):
                 builder.grid(rings[k : k + 2], uv[k : k + 2], WHEEL, black)
 

@@ -37,7 +37,7 @@ def rows_in(before: Agents, after: Agents) -> NDArray[np.int64]:
 
 @lru_cache(maxsize=64)
 def _all_rows(count: int) -> NDArray[np.int64]:
-    """Shared between callers; do not write to it."""
+    """Row numbers [count]. The array is shared between callers; do not modify it."""
     return np.arange(count)
 
 

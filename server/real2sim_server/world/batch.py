@@ -56,9 +56,9 @@ from .world import World
 
 TRACKERS = tuple(name for name, kind in KINDS.items() if kind not in PLANNING_AHEAD)
 FREE = frozenset({"seed", "start_us", "dt_us", "horizon", "sensors", "privileged", "scoring"})
-"""Fields of a reset without restrictions; the caller of the batch renders cameras."""
+"""Fields of a reset that batches support in full; the caller renders cameras."""
 CHECKED = frozenset({"ego", "action", "agents", "contact"})
-"""Fields that are supported in part."""
+"""Fields of a reset that batches support in part."""
 
 
 def check_batchable(spec: ResetSpec) -> None:
@@ -104,7 +104,7 @@ Longs = NDArray[np.int64]
 
 
 class Tracks(NamedTuple):
-    """Objects of the scenario, N of them.
+    """The N objects of the scenario.
 
     Attributes:
         ends, times, knots: trajectories, see ``edit.track_kernels.poses_at``.
@@ -244,7 +244,7 @@ class WorldInstances:
     Attributes:
         things: the background and N objects; ignore their own poses and times.
         poses: [W, 1 + N, 4, 4] float64, ``T_world_object``.
-        there: [W, 1 + N] bool, whether each instance exists now.
+        there: [W, 1 + N] bool, whether each instance exists at the current time.
         times_us: [W] int64, time for colours that change over time [us].
     """
 

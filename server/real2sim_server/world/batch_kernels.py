@@ -33,7 +33,7 @@ NONE, DRIVES, LEFT = 0, 1, 2
 
 @func
 def bodies_of(objects, present, sizes, motion, ego_size):
-    """Bodies as ``traffic.driver.Surroundings`` has them, and the row of each object, or -1."""
+    """Bodies, laid out as in ``traffic.driver.Surroundings``, and the row of each object, or -1."""
     rows = np.full(len(sizes), -1, np.int64)
     bodies = np.empty((len(sizes) + 1, 7))
     count = 0
@@ -234,7 +234,7 @@ def step_world(
 
 @func
 def advanced(state, t_us, dt_us, law, action, plan_us, frame_is_vehicle, vehicle):
-    """State of a vehicle ``dt_us`` after it got an action."""
+    """State of a vehicle ``dt_us`` after it received an action."""
     pending = np.empty((0, 2))
     nothing = np.empty((0, 0))
     schedule = nothing, nothing, nothing, nothing

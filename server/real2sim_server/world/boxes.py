@@ -324,7 +324,7 @@ def first_occupied(way, size, spacing, origin, cell, occupied, sums):
 
 @kernel
 def holds_any(way, reach, origin, cell, sums):
-    """Whether the axis-aligned bounds of a motion, grown by ``reach`` [m], hold an occupied cell.
+    """Whether the bounds of a motion, grown by ``reach`` [m], contain an occupied cell.
 
     See :func:`first_occupied`.
     """
@@ -341,7 +341,7 @@ def holds_any(way, reach, origin, cell, sums):
 
 @kernel
 def _any_occupied(low_x, high_x, low_y, high_y, origin, cell, sums):
-    """Whether an axis-aligned rectangle [m] holds an occupied cell."""
+    """Whether an axis-aligned rectangle [m] contains an occupied cell."""
     nx, ny = sums.shape[0] - 1, sums.shape[1] - 1
     a = min(max(math.floor((low_x - origin[0]) / cell), 0), nx)
     b = min(max(math.floor((high_x - origin[0]) / cell) + 1, 0), nx)

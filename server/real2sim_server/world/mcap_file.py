@@ -41,7 +41,7 @@ AXES = ("x", "y", "z")
 
 
 def cloud_document(cloud: Cloud) -> dict[str, Any]:
-    """The recorded form of a point cloud, in the order of its columns."""
+    """Fields of a recorded point cloud, in the order of its columns."""
     return {
         "frame": cloud.frame,
         "compensated": cloud.compensated,
@@ -123,7 +123,7 @@ ATTACHMENT = "episode.r2e"
 EGO_COLOUR, OBJECT_COLOUR, ROUTE_COLOUR = (0.4, 0.9, 0.4), (1.0, 0.55, 0.25), (0.6, 0.6, 0.6)
 
 Topic = tuple[str, str]
-"""Name of a topic and of its schema."""
+"""Name of a topic and its schema."""
 TRANSFORM: Topic = ("/tf", "foxglove.FrameTransform")
 SCENE: Topic = ("/scene", "foxglove.SceneUpdate")
 PLAN: Topic = ("/plan", "foxglove.PosesInFrame")

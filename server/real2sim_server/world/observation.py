@@ -39,7 +39,7 @@ from .storyboard.program import ShownSignal
 
 
 class PendingStep(NamedTuple):
-    """A step that has moved and is not evaluated yet.
+    """A step after its motion and before its evaluation.
 
     Attributes:
         start: the world before the step.
@@ -235,7 +235,7 @@ def lanes_around(graph: LaneGraph, x: float, y: float) -> tuple[LanePiece, ...]:
     if not len(near):
         return ()
     distances = np.hypot(*(known.values[near, :2] - (x, y)).T)
-    # By distance, then by index, so that ties have the same order everywhere.
+    # Sort by distance, then by index, so that ties have the same order everywhere.
     order = near[np.lexsort((near, distances))]
     _, first = np.unique(known.lane[order], return_index=True)
     lanes = list(graph.lanes.values())

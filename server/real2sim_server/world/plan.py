@@ -230,16 +230,16 @@ class ReferenceTrajectory:
 # --- Legs ----------------------------------------------------------------------------------------
 
 CUSP, ON_AGAIN = 0.05, 0.02
-"""Minimum distances of a plan against and along its headings that count as a change of direction
-[m]; less is noise of a stationary plan."""
+"""Minimum distances against and along the headings of a plan for a change of direction [m].
+Smaller ones are noise of a stationary plan."""
 
 NEAR = 0.05
 """Minimum distance of a single pose on the other side of the vehicle for a gear change [m]."""
 
 
 CREEPING = 0.1
-"""Minimum speed between successive single poses that determines the gear, wherever the vehicle is
-[m/s]."""
+"""Minimum speed between successive single poses that determines the gear, independent of the
+position of the vehicle [m/s]."""
 
 
 @made_quickly

@@ -137,7 +137,7 @@ class MotionHistory:
         whole = [pair for pair in ends[first:] if pair is not None]
         pose = now.transforms[row]
         if not whole or len(whole) < len(ends) - first or not np.array_equal(whole[-1][1], pose):
-            # An edit has placed it here.
+            # An edit has placed the object at this pose.
             return _on(pose, now.velocities[row], 0.0, (times_us - t_us) * 1e-6)
         return _along(times_us, self.segments[first:], whole)
 
@@ -186,7 +186,7 @@ def _on(pose: Float, velocity: Float, yaw_rate: float, seconds: Float) -> Float:
 
 
 KEPT_LIDARS = 32
-"""Sensors whose rays are cached for later episodes."""
+"""Number of sensors with cached rays for later episodes."""
 MAX_SWEEP_US = 1_000_000
 """Maximum duration of a sweep [us]."""
 

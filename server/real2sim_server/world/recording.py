@@ -343,7 +343,7 @@ def record(
         scene_hash: hash of the scene's bundle.
         scenario: id and revision.
         state: state of that scenario.
-        no_action_impact: for NeuroNCAP, see :func:`~.replay.no_action_impact`.
+        no_action_impact: value for NeuroNCAP, see :func:`~.replay.no_action_impact`.
     """
     instants: list[Instant] = []
     digests: list[str] = []
@@ -493,7 +493,7 @@ def _of_parts(parts: Mapping[str, bytes]) -> Recording:
 
 
 def _younger_context(entries: Sequence[Entry]) -> dict[str, Any]:
-    """Context fields that old files only have in the reset."""
+    """Context fields that old files store only in the reset."""
     if not entries or entries[0].kind != "reset":
         return {}
     spec = recorded_spec(entries[0])

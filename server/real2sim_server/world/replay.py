@@ -57,7 +57,7 @@ def stored_spec(fields: Mapping[str, Any]) -> ResetSpec:
         completed["storyboard"] = stored_storyboard(board)
     spec = ResetSpec.model_validate(completed)
     if fields.get("horizon") is None:
-        # Ends with the log, even if the episode could continue beyond it.
+        # The replay ends with the log, even if the episode could continue.
         return spec.model_copy(update={"horizon": None})
     return spec
 

@@ -58,17 +58,17 @@ def warm_up() -> None:
         world.step(TrajectoryPlan(times_us=times, poses=poses, frame="world"))
         world.observe()
     _sweep(world)
-    # Only called for an ego outside its own lane.
+    # Kernel for an ego outside its lane.
     world.context.in_lane(world.instant.ego._replace(offset=10.0))
-    # Only called for an ego that drives against its route.
+    # Kernel for an ego that drives against its route.
     windowed_sum(NONE_AGAINST, 1.0, 2)
-    # Only called for perfect tracking and sliding vehicles.
+    # Kernel for perfect tracking and sliding vehicles.
     _track(EgoSpec(tracker="perfect"))
     # Ground queries of edits, views and rollouts.
     scene.ground.height(0.0, 0.0)
     scene.ground.height_at([[0.0, 0.0]])
     scene.ground.normal_at([[0.0, 0.0]])
-    # An edit that moves the cars close together: only then are their boxes compared.
+    # This edit moves the cars close together, so that their boxes are compared.
     world.apply([Translate(object_id="ahead", x=-9.0)])
 
 

@@ -1,4 +1,4 @@
-"""Boxes and futures of objects: where they are at an instant, and where they go."""
+"""Boxes and future trajectories of objects."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from ...scene import Camera
 from ...world.path import LoggedPath, command_ahead, route_ahead
 from ..drive import Drive
 
-# 3D boxes at an instant: where they are in an image, and as a detector would find them.
+# 3D boxes at an instant, their projections, and simulated detections.
 
 NEAR = 0.1
 """Boxes are cut at this depth in front of a camera [m]."""
@@ -43,7 +43,7 @@ class ObjectBox:
     Attributes:
         object_id: unique in the drive.
         category: as in the scene.
-        instance_id: of its pixels in instance images.
+        instance_id: id of its pixels in instance images.
         size: (length, width, height) along its x, y, z [m].
         T_world_object: [4, 4], origin at the box centre.
         velocity: [3] in the world [m/s].
@@ -58,7 +58,7 @@ class ObjectBox:
 
 
 def boxes_at(placed: PlacedObjects[ObjectState]) -> list[ObjectBox]:
-    """Boxes of all objects that are there, in their order."""
+    """Boxes of all existing objects, in order."""
     return [
         ObjectBox(
             object_id=subject.object_id,
@@ -104,14 +104,14 @@ def _ahead(corners: Float) -> Float:
 
 
 def cut_at_border(box: Box2D, width: int, height: int) -> Box2D | None:
-    """The part of a box inside an image; None if there is none."""
+    """The part of a box inside an image, or None."""
     left, top, right, bottom = box
     cut = (max(left, 0.0), max(top, 0.0), min(right, float(width)), min(bottom, float(height)))
     return cut if cut[0] < cut[2] and cut[1] < cut[3] else None
 
 
 def area(box: Box2D) -> float:
-    """[px^2]."""
+    """Area [px^2]."""
     return (box[2] - box[0]) * (box[3] - box[1])
 
 
@@ -127,7 +127,7 @@ def in_frame(box: ObjectBox, T_frame_world: Float) -> tuple[Float, Float]:
 
 CAR_SIZE = (4.5, 1.8, 1.5)
 REACH = 60.0
-"""False detections are up to so far from the ego [m]."""
+"""Maximum distance of false detections from the ego [m]."""
 
 
 @dataclass(frozen=True)
@@ -136,7 +136,7 @@ class BoxNoise:
 
     Attributes:
         position: standard deviation of each coordinate of the centre [m].
-        size: of each edge, relative to its length.
+        size: standard deviation of each edge, relative to its length.
         heading: [rad].
         missed: share of missed boxes.
         false: mean number of false positives per frame.
@@ -152,14 +152,14 @@ class BoxNoise:
 def noisy_boxes(
     boxes: Sequence[ObjectBox], in_ego: Sequence[Float], noise: BoxNoise, seed: Sequence[int]
 ) -> list[dict[str, Any]]:
-    """Detections of a frame: category, ``T_ego_object``, size, score and object id, None of false
-    ones.
+    """Detections of a frame: category, ``T_ego_object``, size, score and object id (None for false
+    detections).
 
     Args:
-        boxes: of the frame.
+        boxes: boxes of the frame.
         in_ego: their poses [4, 4] in the ego frame.
-        noise: of the detector.
-        seed: the same gives the same detections.
+        noise: error model of the detector.
+        seed: seed of the noise.
     """
     rng = np.random.default_rng(list(seed))
     found = []
@@ -209,9 +209,9 @@ def _about_z(angle: float) -> Float:
 # Targets of prediction and planning.
 
 STEP_US = 500_000
-"""Between instants of a future [us]."""
+"""Time step of futures [us]."""
 AGENT_STEPS, EGO_STEPS = 16, 8
-"""8 s of every agent, 4 s of the ego."""
+"""Number of time steps: 8 s for every agent, 4 s for the ego."""
 
 
 def futures_at(drive: Drive, t_us: int, object_ids: Sequence[str]) -> dict[str, list[list[float]]]:

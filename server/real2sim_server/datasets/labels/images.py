@@ -27,13 +27,13 @@ from .pixels import BODY, TYRE, carry, on_bodies, tell_apart
 # The part of an image that contains the whole object.
 
 MARGIN = 0.1
-"""Gaussians of an object reach beyond its box: by this share of its projection, at least 8 px."""
+"""Margin for Gaussians outside the box, as a share of its projection; at least 8 px."""
 
 
 def object_windows(
     boxes: Sequence[ObjectBox], camera: Camera, T_world_camera: Float
 ) -> list[Window]:
-    """Windows of the objects that are in an image, in their order."""
+    """Windows of the objects in an image, in order."""
     found = []
     for box in boxes:
         whole = projected_box(box.T_world_object, box.size, camera, T_world_camera)
@@ -45,10 +45,10 @@ def object_windows(
 
 
 def window_about(instance_id: int, whole: Box2D, camera: Camera) -> Window:
-    """Whole pixels about a projected box."""
+    """Window of whole pixels around a projected box."""
     wide = max(8.0, MARGIN * (whole[2] - whole[0]))
     high = max(8.0, MARGIN * (whole[3] - whole[1]))
-    # Boxes that reach behind the camera have corners at enormous places.
+    # The corners of boxes that extend behind the camera can have huge coordinates.
     return Window(
         instance_id,
         math.floor(min(max(whole[0] - wide, 0.0), float(camera.width))),
@@ -60,17 +60,17 @@ def window_about(instance_id: int, whole: Box2D, camera: Camera) -> Window:
 
 # --- Surfaces ------------------------------------------------------------------------------------
 
-# A reconstructed object also contains the dark ground below it, which moves with it. Those pixels
-# are ground. The object's box locates them, for road vehicles together with the wheels.
+# A reconstructed object also contains the dark ground below it, which moves with it. These pixels
+# are labelled as ground. They are located by the object's box and, for road vehicles, the wheels.
 
 SURFACE_MARGIN = 0.1
-"""Distance of surfaces outside the box [m]: boxes are as exact as their annotation."""
+"""Tolerance of surfaces outside the box [m], for inexact annotations."""
 
 CLEARANCE = 0.12
-"""What is less above the box's lowest face, below it too, is the ground [m]."""
+"""Maximum height of the ground above the bottom face of the box [m]."""
 
 SILL = 0.11
-"""Below this share of a road vehicle's height are its wheels alone, and between them the shadow."""
+"""Share of a road vehicle's height with only the wheels, and the shadow between them."""
 
 WHEELED = {
     "car": (0.15, 0.22, 0.3, 0.3),
@@ -93,10 +93,10 @@ CONTACT = 0.08
 def on_surface(
     points: NDArray[np.floating], T_world_object: Float, box: ObjectBox
 ) -> NDArray[np.bool_]:
-    """Which points [N, 3] of the world are of an object's surface, [N] bool.
+    """Mask [N] of the world points [N, 3] on an object's surface.
 
     Args:
-        points: at its pixels.
+        points: points at the object's pixels.
         T_world_object: [4, 4] of the box, at the instant of the points.
         box: gives size and category.
     """
@@ -114,7 +114,7 @@ def bodies_of(boxes: Sequence[ObjectBox]) -> Float:
 
 
 def body_of(box: ObjectBox, T_world_object: Float) -> Float:
-    """One of :func:`bodies_of`, at another pose."""
+    """A body of :func:`bodies_of`, at another pose."""
     half = np.asarray(box.size) / 2
     to_object = invert_transform(T_world_object)[:3]
     lowest = -half[2] + min(CLEARANCE, half[2] / 4)
@@ -138,7 +138,7 @@ class CameraImages:
     """Images of one camera.
 
     Attributes:
-        camera: of the images.
+        camera: the camera.
         T_world_camera: [4, 4] its pose, OpenCV.
         rgb: [H, W, 3] uint8.
         depth: [H, W] float32, along the camera's z axis [m], 0 for empty pixels.
@@ -162,7 +162,7 @@ class CameraImages:
 def draw_moment(
     scene: Scene, moment: Moment, cameras: Sequence[Camera], *, backend: str | Backend = "auto"
 ) -> list[CameraImages]:
-    """Images of ``cameras`` in their order. Raises RenderError."""
+    """Images of ``cameras``, in order. Raises RenderError."""
     chosen = select_backend(backend) if isinstance(backend, str) else backend
     boxes = boxes_at(moment.placed)
     draw = _in_one_walk if labels_while_drawing(chosen, cameras) else _in_passes
@@ -250,7 +250,7 @@ def rays_of(K: Float, T_world_camera: Float) -> Float:
 
 
 def slots_of(boxes: Sequence[ObjectBox]) -> NDArray[np.int16]:
-    """Place [65536] of each instance id in ``boxes``, -1 for others."""
+    """Index [65536] of each instance id in ``boxes``, -1 for others."""
     slots = np.full(IDS, -1, np.int16)
     for slot, box in enumerate(boxes):
         slots[box.instance_id] = slot
@@ -284,7 +284,7 @@ def flow_between(
     flow, valid = np.empty((*shape, 2), np.float32), np.empty(shape, np.bool_)
     occluded = np.empty(shape, np.bool_)
     motions, slots = _motions(here, there, boxes_here, boxes_there)
-    # On a distant road, two rows are metres apart: its surface is found between neighbours.
+    # On a distant road, two rows are metres apart, so depths are compared with their neighbours.
     low, high = (spread(there.depth, BLOCK) for spread in (cv2.erode, cv2.dilate))
     shown = low, high, there.instance
     carry(here.depth, here.instance, slots, motions, shown, flow, valid, occluded)

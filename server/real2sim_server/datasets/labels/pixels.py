@@ -17,10 +17,10 @@ from ..._numba import PARALLEL_LOOPS, func, kernel
 
 F32 = np.float32
 BODY = 25
-"""Numbers of a body, see is_surface and shows_surface."""
+"""Number of values of a body, see is_surface and shows_surface."""
 
 TOLERANCE = 0.15
-"""What is nearer to the ground's height shows it [m]."""
+"""Maximum distance from the ground's height of pixels that show the ground [m]."""
 
 UNDER_BODY = 0.6
 """Maximum height of a shadow above the ground [m], the height of the body's underside. Higher
@@ -28,7 +28,7 @@ pixels of an object outside its body are background behind it.
 """
 
 TYRE = 0.24
-"""Wheels reach so far inwards from the sides of the box [m]."""
+"""Width of the wheels, from the sides of the box inwards [m]."""
 
 ROUNDED = 0.06
 """Rounding of a vehicle's lower sides and corners inside its box [m]."""
@@ -37,20 +37,20 @@ SEEN_FARTHER = 0.05
 """Additional tolerance outside the box for a pixel's point [m]; subtracted for its ray."""
 
 NO_STEP = 1e-9
-"""Rays that go less far are followed as if they went so far [m]."""
+"""Minimum length to which rays are extended [m]."""
 
 FLATTEST = 0.01
-"""Rays that fall less by metre of depth are not followed to the ground."""
+"""Minimum descent per metre of depth of rays that are followed to the ground."""
 
 MET = 0.05
 """Tolerance in height from the second step towards the ground on [m]."""
 
 BEHIND = F32(1e-3)
-"""What is less far in front of the other camera is behind it [m]."""
+"""Minimum depth in the other camera; nearer points count as behind it [m]."""
 
 SAME_SURFACE, SLACK = F32(0.03), F32(0.05)
-"""A point is seen in the other image where its depth there differs by at most this share and so
-much more [m]."""
+"""Maximum depth difference of a point that is visible in the other image: relative, plus absolute
+[m]."""
 
 
 @func(inline="always")
@@ -120,14 +120,15 @@ def shows_surface(
 ) -> bool:
     """Whether a ray that ends at a point of the world shows a body there and not its shadow.
 
-    The point of a pixel below a vehicle is accurate to decimetres: at a grazing angle the road
-    appears not far below the sill. The entry of the ray below the sides is as accurate as the box.
+    The point of a pixel below a vehicle is only accurate to decimetres: at a grazing angle, the
+    road appears just below the sill. The point at which the ray enters below the sides is as
+    accurate as the box.
 
     Args:
         body: as in is_surface; and from [21] the sill of vehicles with wheels, 0 for other bodies,
             radius of the wheels, and distance of their axles in front of and behind the centre [m].
         x, y, z: point in the world [m].
-        from_x, from_y, from_z: of the camera.
+        from_x, from_y, from_z: position of the camera [m].
     """
     if body[21] <= 0:
         return is_surface(body, x, y, z)
@@ -167,7 +168,7 @@ def tell_apart(depth, instance, semantic, rays, slots, bodies, classes, behind, 
         bodies: [K, BODY] see shows_surface.
         classes: [65536] uint8, by instance id.
         behind: class of empty pixels.
-        heights, frame: of the ground.
+        heights, frame: grid of the ground.
     """
     x0, y0, per_cell = frame[0], frame[1], 1.0 / frame[2]
     for row in prange(depth.shape[0]):
@@ -195,8 +196,8 @@ def tell_apart(depth, instance, semantic, rays, slots, bodies, classes, behind, 
                 if abs(above) < (UNDER_BODY if shadow else TOLERANCE):
                     found = GROUND
                 if found == GROUND and slope < -FLATTEST:
-                    # Heights are accurate to a centimetre, rendered surfaces to several: along a
-                    # road a centimetre of height is a decimetre of depth.
+                    # The ground is more accurate than rendered surfaces (1 cm against several):
+                    # along a road, a centimetre of height is a decimetre of depth.
                     steepness = 1.0 / slope
                     met = d - above * steepness
                     x, y = met * across + rays[0, 3], met * along + rays[1, 3]
@@ -209,7 +210,7 @@ def tell_apart(depth, instance, semantic, rays, slots, bodies, classes, behind, 
 
 @func(inline="always")
 def height_over(heights: Any, x0: float, y0: float, per_cell: float, x: float, y: float) -> float:
-    """As height_under, with one over the edge of a cell."""
+    """Like height_under, with the inverse of the cell size."""
     rows, columns = heights.shape
     u = min(max((x - x0) * per_cell, 0.0), rows - 1.0)
     v = min(max((y - y0) * per_cell, 0.0), columns - 1.0)
@@ -223,7 +224,7 @@ def height_over(heights: Any, x0: float, y0: float, per_cell: float, x: float, y
 
 @kernel
 def surface_mask(depth, left, top, rays, body, mask):
-    """Where a window [h, w] of depths shows the surface of one body; ``mask`` [h, w] uint8."""
+    """Write to ``mask`` [h, w] uint8 where a window [h, w] of depths shows a body's surface."""
     for row in range(depth.shape[0]):
         for column in range(depth.shape[1]):
             d = np.float64(depth[row, column])
@@ -238,7 +239,7 @@ def surface_mask(depth, left, top, rays, body, mask):
 
 @kernel
 def on_bodies(points, body, found):
-    """Write which points [N, 3] of the world belong to a body to ``found`` [N] bool."""
+    """Write to ``found`` [N] bool whether world points [N, 3] belong to a body."""
     for k in range(points.shape[0]):
         found[k] = is_surface(body, points[k, 0], points[k, 1], points[k, 2])
 

@@ -1,4 +1,4 @@
-"""Points with labels: counted in boxes, from the depth of cameras, from LiDAR sweeps."""
+"""Labelled points from camera depth or LiDAR sweeps, and point counts of boxes."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ ROOF = (0.9, 0.0, 1.73)
 BEAMS, COLUMNS = 64, 1024
 ELEVATION = (np.radians(-25.0), np.radians(3.0))
 NEAR, FARTHEST = 1.0, 80.0
-"""Between these distances seen from above there are points [m]."""
+"""Range of horizontal distances with points [m]."""
 NEAREST = 0.25
-"""A pixel is on a beam where it is off by less than this share of the gap between two."""
+"""Maximum distance of a pixel from a beam, as a share of the gap between beams."""
 
 
 def points_in_boxes(points: ArrayLike, transforms: ArrayLike, sizes: ArrayLike) -> list[int]:
-    """How many points are in each box, faces included, the box not enlarged.
+    """Number of points in each box, including its faces, without a margin.
 
     Args:
         points: [N, 3] in some frame [m].
@@ -129,7 +129,7 @@ def _beams_of(image: CameraImages, to_ego: Float) -> tuple[NDArray[np.generic], 
     azimuth = np.arctan2(y.ravel()[chosen], x.ravel()[chosen])
     turn = (azimuth * np.float32(COLUMNS / (2 * np.pi)) + COLUMNS // 2).astype(np.int64) % COLUMNS
     place = beam.ravel()[chosen].astype(np.int64) * COLUMNS + turn
-    # If several pixels are on a beam, the last one written is used: the nearest to the beam.
+    # The pixel nearest to the beam is written last and overwrites the others.
     farthest_first = np.argsort((off.ravel()[chosen] * -60_000).astype(np.int16), kind="stable")
     nearest = np.full(BEAMS * COLUMNS, -1)
     nearest[place[farthest_first]] = chosen[farthest_first]
@@ -159,7 +159,7 @@ def _velocities(
 # A sweep through the scene, labelled ray by ray.
 
 SAME_SURFACE = 0.3
-"""A return belongs to the surface at the median of the light within this distance [m]."""
+"""Maximum distance of a return from the median of the light on the same surface [m]."""
 
 
 def lidar_points(
@@ -171,15 +171,15 @@ def lidar_points(
     seed: int,
     caster: CastBackend,
 ) -> SeenPoints:
-    """All returns of the sweep about a moment, rays in their order, near returns first.
+    """All returns of the sweep around a moment, ordered by ray, then from near to far.
 
     Args:
-        drive: that is driven.
-        moment: in the middle of the sweep of a spinning sensor.
-        boxes: of the moment.
+        drive: the drive.
+        moment: state in the middle of the sweep of a spinning sensor.
+        boxes: boxes at the moment.
         lidar: the sensor.
-        seed: of losses and range noise.
-        caster: follows the rays.
+        seed: seed of losses and range noise.
+        caster: casts the rays.
     """
     met = drive.sweep_at(lidar, moment.t_us)
     request = met.things.request(lidar, met.T_world_lidar)
@@ -204,7 +204,7 @@ def lidar_points(
 
 
 def _returns(sweep: Sweep) -> tuple[NDArray[np.int64], Float, NDArray[np.uint8]]:
-    """Ray, range and number of each return; near ones first, equal ones once."""
+    """Ray, range and number of each return, near ones first, without duplicates."""
     names = [name for name in ("first", "strongest", "last") if name in sweep.returns]
     ranges = [sweep.returns[name].ravel() for name in names] or [sweep.range.ravel()]
     each = np.sort(np.stack(ranges).astype(np.float64), axis=0)
@@ -216,7 +216,7 @@ def _returns(sweep: Sweep) -> tuple[NDArray[np.int64], Float, NDArray[np.uint8]]
 
 
 def _rows(lidar: Lidar) -> NDArray[np.uint8]:
-    """Row of each ray, the lowest is 0; 0 if the sensor has no rows."""
+    """Row of each ray, counted from the lowest; 0 if the sensor has no rows."""
     if len(lidar.shape) != 2:
         return np.zeros(lidar.beams.count, np.uint8)
     elevation = lidar.beams.elevation.mean(axis=1)
@@ -260,7 +260,7 @@ def _objects(
 
 
 def _speed(poses: Float, times_us: Float, slots: NDArray[np.int32], local: Float) -> Float:
-    """Velocity [N, 3] of points of a body, from where they are an instant before and after."""
+    """Velocity [N, 3] of points of a body, by central differences."""
     if len(times_us) < 2:
         return np.zeros_like(local)
     before, after = np.maximum(slots - 1, 0), np.minimum(slots + 1, len(times_us) - 1)
@@ -283,6 +283,6 @@ def _classes(
 
 
 def _each(transforms: Float, points: Float) -> Float:
-    """Points [N, 3], each by its own transform [N, 4, 4]."""
+    """Points [N, 3], transformed row by row by [N, 4, 4]."""
     moved: Float = np.einsum("nij,nj->ni", transforms[:, :3, :3], points) + transforms[:, :3, 3]
     return moved

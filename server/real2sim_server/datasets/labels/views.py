@@ -1,4 +1,4 @@
-"""Each object in the image of a camera: its pixels, its boxes, how much of it is seen."""
+"""Views of objects in a camera image: pixels, boxes and visibility."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from .boxes import NEAR, Box2D, ObjectBox, area, cut_at_border, projected_box
 from .images import CameraImages, body_of, rays_of, window_about
 from .pixels import surface_mask
 
-# How each label is made; the manifest of every export has these texts.
+# Source of each label. The manifest of every export contains these texts.
 
 HOW = {
     "box_3d": "box: pose and size that the drive has for the object, exact",
@@ -55,7 +55,7 @@ HOW = {
 
 
 MIN_BLOB_PIXELS = 8
-"""Connected pixels of an object that are fewer do not count [px]."""
+"""Minimum size of connected parts of an object [px]."""
 
 ALONE = RasterOptions(depth=False, instance=True, median_depth=True)
 
@@ -65,11 +65,11 @@ class ObjectView:
     """One object in one image.
 
     Attributes:
-        object_id, instance_id: of the object.
-        amodal_box: of the projected 3D box, clipped to near plane and image [px].
-        modal_box: of the object's pixels; None if none is visible [px].
-        visible_pixels: of the object in the scene.
-        alone_pixels: of the object in this image without other objects.
+        object_id, instance_id: ids of the object.
+        amodal_box: bounds of the projected 3D box, clipped to near plane and image [px].
+        modal_box: bounds of the object's visible pixels [px]; None without any.
+        visible_pixels: number of the object's visible pixels.
+        alone_pixels: number of its pixels in this image without other objects.
         truncation: share of the projected box outside the image, 0 to 1.
     """
 
@@ -83,13 +83,13 @@ class ObjectView:
 
     @property
     def visibility(self) -> float:
-        """Share of its pixels in this image that nothing hides, 0 to 1."""
+        """Share of its pixels in this image that are not occluded, 0 to 1."""
         return min(self.visible_pixels / self.alone_pixels, 1.0) if self.alone_pixels else 0.0
 
 
 @dataclass(frozen=True, eq=False)
 class CameraView:
-    """The objects in one image, by rising id, and the image."""
+    """The image, and the objects in it by increasing id."""
 
     images: CameraImages
     objects: tuple[ObjectView, ...]
@@ -102,11 +102,11 @@ def views_of(
     *,
     backend: str | Backend = "auto",
 ) -> CameraView:
-    """Every object with its box in the image.
+    """Views of all objects with a box in the image.
 
     Args:
-        images: of the camera.
-        boxes: of all objects at this time.
+        images: images of the camera.
+        boxes: boxes of all objects at this time.
         instances: rendered instances.
         backend: renders single objects.
     """
@@ -189,7 +189,7 @@ def _drawn_alone(
 def _pixels_of(
     depth: NDArray[np.float32], window: Window, box: ObjectBox, images: CameraImages
 ) -> int:
-    """Pixels of the object's surface where it has these depths."""
+    """Mask of the pixels whose depths are on the object's surface."""
     mask = np.empty(depth.shape, np.bool_)
     rays = rays_of(images.camera.K, images.T_world_camera)
     body = body_of(box, box.T_world_object)
@@ -199,13 +199,13 @@ def _pixels_of(
 
 # --- Keypoints -----------------------------------------------------------------------------------
 
-# COCO's 17 keypoints of people: where they are, and whether an image shows them.
+# COCO's 17 keypoints of people: positions and visibility.
 
 UNDER = 0.2
 """Maximum depth of a joint below its visible skin [m]."""
 
 OUTSIDE, HIDDEN, VISIBLE = 0, 1, 2
-"""COCO's flags: not in the image, in it behind something, seen."""
+"""COCO's visibility flags: outside the image, occluded, visible."""
 
 
 def keypoints_at(
@@ -218,10 +218,10 @@ def keypoints_at(
     """Keypoints [17, 3] of all walking people, world frame [m], by object id.
 
     Args:
-        scene: of the objects.
+        scene: scene of the objects.
         placed: their poses.
         t_us: time [us].
-        strides: of people without a trajectory.
+        strides: walking states of people without a trajectory.
     """
     found = {}
     for subject, transform in zip(placed.objects, placed.transforms, strict=True):
@@ -242,9 +242,9 @@ def keypoints_in_image(
     have position 0, 0.
 
     Args:
-        points: of one person.
-        images: of the camera.
-        instance_id: of the person's pixels.
+        points: keypoints of one person [m].
+        images: images of the camera.
+        instance_id: id of the person's pixels.
     """
     local = apply_transform(invert_transform(images.T_world_camera), points)
     depths = local[:, 2]

@@ -33,7 +33,7 @@ def writer_names() -> list[str]:
 
 
 def writer_of(name: str) -> DatasetWriter:
-    """The writer of that name. Raises DatasetError with those there are."""
+    """The writer of that name. Raises DatasetError, which lists the names, if it is unknown."""
     for writer in WRITERS:
         if writer.name == name:
             return writer

@@ -126,7 +126,7 @@ def _write_annotations(path: Path, drive: LabelledDrive, clip: Clip) -> None:
 
 
 def _counts(clip: Clip, frame: Mapping[str, Any]) -> list[int]:
-    """Points in each box of a frame as the sweep has them: rounding moves some across a face."""
+    """Number of points in each box of a frame, counted in the rounded points of the sweep."""
     subjects = frame["objects"]
     poses = _shift(-AXLE_HEIGHT) @ _poses_of(subjects)
     return points_in_boxes(_xyz(clip, frame["index"]), poses, [s["size"] for s in subjects])

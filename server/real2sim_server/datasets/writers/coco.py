@@ -28,18 +28,18 @@ CATEGORY_IDS = {
     "animal": 96, "barrier": 97, "cone": 98, "debris": 99, "pole": 100, "sign": 101,
     "traffic_sign": 102,
 }  # fmt: skip
-"""Categories of every export. Ids up to 90 are COCO's own; all others have an id from 1000 on,
+"""Categories of every export. Ids up to 90 are COCO's. All others have an id from 1000 on,
 derived from their name.
 """
 
 COCO_NAMES = {"pedestrian": "person", "traffic_light": "traffic light"}
-"""COCO's name by ours, where they differ."""
+"""COCO's name by category, if they differ."""
 
 STUFF_FROM = 200
-"""A category of the background is this plus its semantic class."""
+"""Offset of background categories; the semantic class is added."""
 
 INSTANCES_FROM = 1 << 16
-"""The panoptic id of an object is this plus its number; the id of background is its category."""
+"""Offset of the panoptic ids of objects; background pixels have the id of their category."""
 
 QUALITY = 95
 PERSON = {
@@ -266,8 +266,10 @@ def run_lengths(mask: NDArray[np.bool_]) -> list[int]:
 
 
 def compressed_rle(mask: NDArray[np.bool_]) -> str:
-    """Run lengths as COCO stores them: from the third on the difference to the one two before,
-    each in groups of five bits, lowest first, 32 where more follow, 48 added."""
+    """Run lengths as a COCO string.
+
+    From the fourth on, the difference to the length two positions before is stored. Each number is
+    split into groups of five bits, lowest first, with bit 32 if more follow, plus 48."""
     counts = run_lengths(mask)
     text = []
     for k, count in enumerate(counts):

@@ -38,7 +38,7 @@ VELODYNE = (0.9, 0.0, 1.73)
 """Position of the scanner in the vehicle's frame [m], at KITTI's height above the road."""
 
 ROUNDS = 8
-"""Iterations to find a point that is right after motion compensation."""
+"""Iterations to invert the motion compensation of a point."""
 
 
 class KittiWriter:
@@ -122,7 +122,7 @@ def _seen_rows(frame: Mapping[str, Any], camera: Camera) -> list[dict[str, Any]]
 
 
 def _all_rows(frame: Mapping[str, Any], camera: Camera) -> list[dict[str, Any]]:
-    """All objects, those that the camera does not see too."""
+    """All objects, including those outside the camera's view."""
     seen = {view["object_id"]: view for view in frame["views"][camera.name]}
     unseen = {"box_2d_modal": None, "visibility": 0.0, "truncation": 1.0}
     to_camera = invert_transform(camera.T_vehicle_camera)
@@ -156,7 +156,7 @@ def _wrapped(angle: float) -> float:
 
 
 def _calibration(camera: Camera, rectification: str, velo_to_cam: str) -> list[str]:
-    """The camera takes the place of KITTI's colour camera, and is its own reference."""
+    """Calibration with the camera as KITTI's colour camera and as the reference."""
     K = camera.K.copy()
     K[:2, 2] -= 0.5
     projection = np.concatenate([K, np.zeros((3, 1))], axis=1)
@@ -185,14 +185,14 @@ def vehicle_in_ego(camera: Camera) -> Float:
 
 
 def shift(position: Sequence[float]) -> Float:
-    """A place [m] as a transform."""
+    """A position [m] as a transform."""
     matrix = np.eye(4)
     matrix[:3, 3] = position
     return matrix
 
 
 def write_scan(path: Path, clip: Clip, camera: Camera, frame: int) -> None:
-    """x, y, z and reflectance of each point, float32, as a scanner that moves measures them."""
+    """x, y, z and reflectance of each point, float32, as measured by the moving scanner."""
     rows = clip.points(frame)
     T_vehicle_velo = shift(VELODYNE)
     vehicle = vehicle_in_ego(camera)
@@ -206,8 +206,9 @@ def write_scan(path: Path, clip: Clip, camera: Camera, frame: int) -> None:
 
 
 def _as_measured(points: Float, poses: Float, frame: int, to_velo: Float) -> Float:
-    """Points [N, 3] as of one instant in the vehicle's frame at their own instants: the scanner
-    turns clockwise once a frame, and looks ahead at the frame's time."""
+    """Points [N, 3] of one instant, moved to the vehicle frame at their times of measurement.
+
+    The scanner turns clockwise once per frame and looks ahead at the frame's time."""
     measured = points
     for _ in range(ROUNDS):
         local = apply_transform(to_velo, measured)
@@ -217,7 +218,7 @@ def _as_measured(points: Float, poses: Float, frame: int, to_velo: Float) -> Flo
 
 
 def numbers(values: Any) -> str:
-    """Nine digits, as in KITTI's tables."""
+    """A number with nine decimal digits, as in KITTI's tables."""
     return " ".join(f"{value + 0.0:.9g}" for value in np.asarray(values).tolist())
 
 
@@ -230,7 +231,7 @@ def _write_lines(path: Path, lines: Sequence[str]) -> None:
 
 # A drive for each clip and camera, with GPS/IMU records and tracklets. Source: Geiger et al.,
 # "Vision meets Robotics: The KITTI Dataset", IJRR 2013, and the raw data's development kit. Camera,
-# scanner and scans are as above; the GPS/IMU unit is the ego's origin. Boxes turn about the
+# scanner and scans are as above. The GPS/IMU unit is at the ego's origin. Boxes rotate about the
 # scanner's vertical axis only.
 
 DAY = "2011_09_26"
@@ -272,7 +273,7 @@ def _write_drive(folder: Path, clip: Clip, camera: Camera) -> None:
 
 
 def _stamp(t_us: int) -> str:
-    """Since the day's noon, as a date and time with nanoseconds."""
+    """Time since noon as a date and time with nanoseconds."""
     noon = datetime.datetime(2011, 9, 26, 12)
     return f"{noon + datetime.timedelta(microseconds=t_us):%Y-%m-%d %H:%M:%S.%f}000"
 

@@ -1,4 +1,4 @@
-"""MCAP: a file a clip with images, points, boxes and poses, for Foxglove, Rerun and other viewers.
+"""MCAP: one file per clip with images, points, boxes and poses, for Foxglove, Rerun and others.
 
 Source: the MCAP specification 1.0 and Foxglove's schemas in JSON. Needs the ``mcap`` extra.
 """

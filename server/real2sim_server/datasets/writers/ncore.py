@@ -1,8 +1,8 @@
-"""NCore v4: a store for each clip, with poses, calibration, cameras, LiDAR and cuboids.
+"""NCore v4: one store per clip, with poses, calibration, cameras, LiDAR and cuboids.
 
-Source: the components of ``ncore.data.v4`` (NVIDIA NCore, data version v4). A frame's images and
-points hold for one instant: points are seen from where the LiDAR is then. Frames of reference are
-``world``, ``rig`` (the ego), one a camera, and ``lidar_top``.
+Source: the components of ``ncore.data.v4`` (NVIDIA NCore, data version v4). The images and points
+of a frame refer to one instant, with the LiDAR at its position at that time. Frames of reference
+are ``world``, ``rig`` (the ego), one per camera, and ``lidar_top``.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from .writer import LabelledDrive
 # --- Zarr ----------------------------------------------------------------------------------------
 
 # A version 2 store as a folder. Sources: the specification of zarr's storage, version 2; RFC 8949
-# (CBOR) for the file that holds NCore's metadata.
+# (CBOR) for the file with NCore's metadata.
 
 ZLIB_LEVEL = 1
 SIMPLE = {False: b"\xf4", True: b"\xf5", None: b"\xf6"}
@@ -39,7 +39,7 @@ class ZarrStore:
     """A store that is written once, starting at its root.
 
     Args:
-        folder: of the store; newly created.
+        folder: folder of the store; newly created.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -76,7 +76,7 @@ class ZarrStore:
             (self._folder / path / ".".join("0" * values.ndim)).write_bytes(chunk)
 
     def encoded(self, path: str, data: bytes, attributes: Mapping[str, Any]) -> None:
-        """Bytes that do not end with a zero, as they are."""
+        """Store bytes unchanged; they must not end with a zero."""
         content = {
             "zarr_format": 2,
             "shape": [],
@@ -134,14 +134,14 @@ VERSION, COMPONENT_VERSION = "v4", "v1"
 INSTANCE = "default"
 RIG, WORLD, LIDAR = "rig", "world", "lidar_top"
 START_US = 1_000_000
-"""Offset of all times, which NCore stores unsigned [us]."""
+"""Offset of all times [us], because NCore stores unsigned times."""
 QUALITY = 95
 LABELS = ("depth", "instance", "semantic")
 POINT_LABELS = ("instance", "semantic", "velocity", "beam", "time_us", "return_number")
 
 
 class NCoreWriter:
-    """Writes ``<split>/<sequence>.ncore4.zarr``, a sequence a clip."""
+    """Writes ``<split>/<sequence>.ncore4.zarr``, one sequence per clip."""
 
     name = "ncore"
     holds = "v4 stores: poses, intrinsics, cameras and lidars with labels, cuboids"
@@ -159,7 +159,7 @@ def _write_sequence(store: ZarrStore, drive: LabelledDrive, clip: Clip, sequence
     times = [_stamp(frame) for frame in clip.frames]
     poses = [frame["T_world_ego"] for frame in clip.frames]
     if len(times) == 1:
-        # A trajectory has two poses at least.
+        # A trajectory needs at least two poses.
         times, poses = [times[0], times[0] + 1], poses * 2
     store.group(
         "",

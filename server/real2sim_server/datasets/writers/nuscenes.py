@@ -1,8 +1,8 @@
 """nuScenes v1.0 with lidarseg and panoptic: key frames at 2 Hz, all other frames as sweeps.
 
 Source: Caesar et al., "nuScenes: A multimodal dataset for autonomous driving", CVPR 2020, and
-``docs/schema_nuscenes.md`` of its development kit. A clip is a scene, the world of the drive is the
-map's frame; ``LIDAR_TOP`` holds the labelled points. Pixel centres are at integers.
+``docs/schema_nuscenes.md`` of its development kit. A clip is a scene, and the world of the drive is
+the frame of the map. ``LIDAR_TOP`` contains the labelled points. Pixel centres are at integers.
 """
 
 from __future__ import annotations
@@ -46,9 +46,9 @@ CATEGORIES = {
     "pushable_pullable": "movable_object.pushable_pullable",
     "bicycle_rack": "static_object.bicycle_rack",
 }
-"""nuScenes' category by ours."""
+"""nuScenes category by category."""
 OTHER = "static.other"
-"""All others: the devkit opens no data set with classes of points that it has no colour for."""
+"""Category of all others. The devkit rejects point classes without a colour."""
 
 CLASSES = (
     "noise", "animal", "human.pedestrian.adult", "human.pedestrian.child",
@@ -61,13 +61,13 @@ CLASSES = (
     "vehicle.trailer", "vehicle.truck", "flat.driveable_surface", "flat.other", "flat.sidewalk",
     "flat.terrain", "static.manmade", "static.other", "static.vegetation", "vehicle.ego",
 )  # fmt: skip
-"""The categories of nuScenes-lidarseg in their order: the place is the index."""
+"""The categories of nuScenes-lidarseg in the order of their indices."""
 
 LEVELS = ("v0-40", "v40-60", "v60-80", "v80-100")
 BOUNDS = (0.4, 0.6, 0.8)
 DRIVEABLE, MANMADE = "flat.driveable_surface", "static.manmade"
 PANOPTIC = 1000
-"""A panoptic label is this times the index of the category, plus the object's number."""
+"""Factor of the category index in a panoptic label; the object's number is added."""
 SPEED_MOVING = 0.2
 MAP_CELL = 0.1
 """Cell of the ground mask, as in the development kit [m]."""
@@ -160,7 +160,7 @@ class _Tables:
         ground = self.drive.ground
         factor = round(ground.cell / MAP_CELL)
         known = np.repeat(np.repeat(ground.is_ground, factor, axis=0), factor, axis=1)
-        # Rows of the picture run from north to south.
+        # Image rows run from north to south.
         picture = np.ascontiguousarray(known[:MAX_MAP, :MAX_MAP].T[::-1].astype(np.uint8) * 255)
         token = self.drive.token("map")
         path = folder / "maps" / f"{token}.png"
@@ -345,7 +345,7 @@ def _category(category: str) -> str:
 
 
 def _key_frames(clip: Clip) -> list[int]:
-    """The first frame, and each that is at least half a second after the key frame before."""
+    """The first frame, and every frame at least half a second after the previous key frame."""
     keys = [0]
     for k, frame in enumerate(clip.frames):
         if frame["t_us"] - clip.frames[keys[-1]]["t_us"] >= KEY_PERIOD_US:

@@ -189,7 +189,7 @@ QUALITY = 95
 
 
 class WebDatasetWriter:
-    """Writes ``<split>-NNNNNN.tar``, a clip each."""
+    """Writes ``<split>-NNNNNN.tar``, one per clip."""
 
     name = "webdataset"
     holds = "tar shards: jpg, depth.png, instance.png, semantic.png, flow png and json a sample"

@@ -64,23 +64,23 @@ PANOPTIC = "[CameraSegmentationLabelComponent]"
 POINT_CLASS = "[LiDARSegmentationLabelComponent].range_image_return"
 GLOBAL_SHUTTER = 5
 COLUMNS = 4096
-"""Columns of range images: finer than any LiDAR of the catalogue, so no cell has two returns."""
+"""Columns of range images, finer than all LiDARs of the catalogue: one return per cell."""
 LEVEL_1, LEVEL_2, FEW_POINTS = 1, 2, 5
-"""A box with this few points or fewer is hard, as in the data set's own evaluation."""
+"""Maximum number of points in a difficult box, as in the data set's evaluation."""
 DIVISOR = 1000
 QUALITY = 95
 POINT_CLASSES = {"car": 1, "truck": 2, "bus": 3, "trailer": 4, "train": 4, "person": 7, "rider": 6}
 POINT_CLASSES |= {"motorcycle": 13, "bicycle": 12, "traffic sign": 8, "traffic light": 9}
 POINT_CLASSES |= {"pole": 10, "ground": 20}
-"""Classes of points; others are undefined, 0."""
+"""Waymo's classes of points; all others are 0 (undefined)."""
 PIXEL_CLASSES = {"car": 2, "truck": 3, "bus": 4, "trailer": 8, "train": 5, "person": 9, "rider": 10}
 PIXEL_CLASSES |= {"motorcycle": 7, "bicycle": 6, "traffic sign": 17, "traffic light": 18}
 PIXEL_CLASSES |= {"pole": 15, "sky": 25, "ground": 26, "dynamic": 27, "static": 28}
-"""Classes of pixels; others are undefined, 0."""
+"""Waymo's classes of pixels; all others are 0 (undefined)."""
 
 
 class WaymoWriter:
-    """Writes ``<split>/<component>/<segment>.parquet``, a segment a clip."""
+    """Writes ``<split>/<component>/<segment>.parquet``, one segment per clip."""
 
     name = "waymo"
     holds = "v2 components: poses, images, calibrations, LiDAR, 3D and 2D boxes, both segmentations"
@@ -109,7 +109,7 @@ def camera_numbers(cameras: Sequence[Camera]) -> dict[str, int]:
     they match, otherwise free numbers.
 
     Raises:
-        DatasetError: more than five.
+        DatasetError: there are more than five cameras.
     """
     if len(cameras) > len(CAMERA_NAMES):
         raise DatasetError(f"format 'waymo' holds {len(CAMERA_NAMES)} cameras, not {len(cameras)}")
@@ -218,7 +218,7 @@ def _write_frame(
 
 
 def _velocity(clip: Clip, frame: Mapping[str, Any]) -> dict[str, Any]:
-    """Velocity of the vehicle along and about the world's axes, from the adjacent frames."""
+    """Linear and angular velocity of the vehicle in the world, from the adjacent frames."""
     before, after, seconds = _around(clip, frame)
     poses = np.array([before["T_world_ego"], after["T_world_ego"]])
     moved = poses[1, :3, 3] - poses[0, :3, 3]
@@ -232,8 +232,9 @@ def _velocity(clip: Clip, frame: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _around(clip: Clip, frame: Mapping[str, Any]) -> tuple[Any, Any, float]:
-    """The frames before and after a frame, or the frame itself at an end of the clip, and the time
-    between them [s]; for a single frame, itself twice and 1.
+    """The frames before and after a frame, and the time between them [s].
+
+    At the ends of a clip, the frame replaces the missing one. A clip of one frame has a time of 1.
     """
     place = next(k for k, other in enumerate(clip.frames) if other["index"] == frame["index"])
     before = clip.frames[max(place - 1, 0)]
@@ -242,7 +243,7 @@ def _around(clip: Clip, frame: Mapping[str, Any]) -> tuple[Any, Any, float]:
 
 
 def _cameras_covered(cameras: Sequence[Camera]) -> dict[str, bytes]:
-    """Per camera a png with the number of cameras that see each of its pixels, at infinity."""
+    """One png per camera with the number of cameras that see each pixel's direction."""
     covered = {}
     for camera in cameras:
         directions = _directions(camera)
@@ -271,7 +272,7 @@ def _write_boxes(files: _Components, clip: Clip, frame: Mapping[str, Any], start
     vectors = {
         "box.center": poses[:, :3, 3],
         "box.size": np.array([subject["size"] for subject in objects]).reshape(-1, 3),
-        # Along the world's axes, as Waymo's speeds.
+        # Along the axes of the world, as in Waymo.
         "speed": np.array([subject["velocity"] for subject in objects]).reshape(-1, 3),
         "acceleration": _accelerations(clip, frame),
     }
@@ -299,13 +300,13 @@ def _write_boxes(files: _Components, clip: Clip, frame: Mapping[str, Any], start
 
 
 def _accelerations(clip: Clip, frame: Mapping[str, Any]) -> Float:
-    """[K, 3] of a frame's objects along the world's axes, from the frames before and after."""
+    """Velocities [K, 3] of a frame's objects in the world, from the frames before and after."""
     before, after, seconds = _around(clip, frame)
     earlier, later = objects_of(before), objects_of(after)
     rows = np.zeros((len(frame["objects"]), 3))
     for k, subject in enumerate(frame["objects"]):
         own = subject["object_id"]
-        # Who is there in one of them alone has half the time, between that one and now.
+        # An object missing in one of the two frames uses the time between the other one and now.
         one, other = earlier.get(own, subject), later.get(own, subject)
         share = 1.0 if own in earlier and own in later else 0.5
         change = np.array(other["velocity"]) - np.array(one["velocity"])
@@ -338,7 +339,7 @@ def _write_camera_boxes(
                 for k, axis in enumerate("xy")
             },
             f"{CAMERA_BOX}.type": pa.array(types, pa.int8()),
-            # Difficulty is a human label of pictures.
+            # Waymo's difficulty is a human annotation.
             f"{CAMERA_BOX}.difficulty_level.detection": pa.array([0] * len(seen), pa.int8()),
             f"{CAMERA_BOX}.difficulty_level.tracking": pa.array([0] * len(seen), pa.int8()),
         },
@@ -425,7 +426,7 @@ def _pixel_poses(
     """
     assert laser.inclinations is not None
     poses = np.zeros((len(laser.inclinations), COLUMNS, 6), np.float32)
-    # The first return of a cell is written last, so it is the exact one.
+    # The first return of a cell is written last, so its pose is exact.
     for place, rows in reversed(returns):
         values = np.zeros((len(laser.inclinations), COLUMNS, 2), np.float32)
         values[place[0], place[1], 0] = _ranges(rows, laser)
@@ -453,7 +454,7 @@ def _inclinations(drive: LabelledDrive, clip: Clip) -> Float:
 
 
 def _beams(clip: Clip) -> int:
-    """One more than the highest beam of any frame."""
+    """Number of beams: one more than the highest beam of any frame."""
     rows = [clip.points(frame["index"])["beam"] for frame in clip.frames]
     return 1 + max((int(beams.max()) for beams in rows if len(beams)), default=0)
 
@@ -465,7 +466,7 @@ def _laser_pose(drive: LabelledDrive) -> Float:
 
 
 def _classes(known: Mapping[str, int]) -> NDArray[np.int32]:
-    """Waymo's class by ours."""
+    """Waymo class by class."""
     table = np.zeros(256, np.int32)
     for name, number in known.items():
         table[SEMANTIC_CLASSES[name]] = number

@@ -18,15 +18,15 @@ class LabelledDrive:
     """Input of writers.
 
     Attributes:
-        name: of the data set.
+        name: name of the data set.
         digest: SHA-256 of its inputs; tokens are derived from it.
-        cameras: in order, at the size of the images.
+        cameras: cameras in order, at the size of the images.
         ego_size: (length, width, height) of the ego [m].
-        period_us: between frames [us].
-        clips: in order.
-        ground: of the scene.
+        period_us: time between frames [us].
+        clips: clips in order.
+        ground: ground of the scene.
         licence: terms of use.
-        lidar_position: of the LiDAR, in the ego frame [m].
+        lidar_position: position of the LiDAR in the ego frame [m].
     """
 
     name: str
@@ -40,7 +40,7 @@ class LabelledDrive:
     lidar_position: tuple[float, float, float]
 
     def token(self, *parts: object) -> str:
-        """32 hexadecimal digits, the same for the same parts of the same export."""
+        """A token of 32 hexadecimal digits, derived from the export and the given parts."""
         text = "/".join((self.digest, *map(str, parts)))
         return hashlib.sha256(text.encode()).hexdigest()[:32]
 
@@ -55,13 +55,13 @@ class DatasetWriter(Protocol):
     """Description of the output in one line."""
 
     def write(self, drive: LabelledDrive, folder: Path) -> None:
-        """Fill the empty ``folder``: the same bytes for the same drive, whatever the machine, the
-        day or the folder."""
+        """Fill the empty ``folder``. The bytes must only depend on the drive, not on the machine,
+        the date or the folder."""
         ...
 
 
 def write_json(path: Path, content: Any) -> None:
-    """The same bytes for the same content."""
+    """Canonical JSON: the same content gives the same bytes."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 

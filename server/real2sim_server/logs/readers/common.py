@@ -24,7 +24,7 @@ class FrameBox:
     """One object in one frame.
 
     Attributes:
-        key: the dataset's own name of the track.
+        key: name of the track in the dataset.
         category: the project's category.
         size: (length, width, height) [m].
         time_us: [us].

@@ -82,7 +82,7 @@ class Tables:
         return self._rows[name]
 
     def row(self, name: str, token: str) -> Mapping[str, Any]:
-        """The row with a token. Raises LogError if there is none."""
+        """The row with a token. Raises LogError if it is missing."""
         try:
             return self._by_token[name][token]
         except (KeyError, TypeError):
@@ -122,7 +122,7 @@ class ParquetFile:
         self._groups: OrderedDict[tuple[int, str], Any] = OrderedDict()
         try:
             self._file = pq.ParquetFile(path)
-        except (OSError, pa.ArrowException, UnicodeDecodeError) as error:  # Damaged name.
+        except (OSError, pa.ArrowException, UnicodeDecodeError) as error:  # A damaged column name.
             raise LogError(f"{path}: cannot be read as Parquet ({_line(error)})") from error
         with _broken_named(f"{path}: the list of columns"):
             self.names = frozenset(self._file.schema_arrow.names)
@@ -237,7 +237,7 @@ def read_feather(path: Path, columns: Sequence[str]) -> dict[str, NDArray[Any]]:
             table = ipc.open_file(file).read_all()
         # Unvalidated offsets could point outside the file.
         table.validate(full=True)
-    except (OSError, ValueError, pa.ArrowException) as error:  # Damaged text.
+    except (OSError, ValueError, pa.ArrowException) as error:  # Damaged text in a cell.
         raise LogError(f"{path}: cannot be read as a Feather file ({_line(error)})") from error
     with _broken_named(f"{path}: the list of columns"):
         _require(path, columns, list(table.column_names))

@@ -58,8 +58,8 @@ def read_pickled_arrays(path: Path, name: str) -> dict[Any, NDArray[Any]]:
     separate process that returns only plain ``.npy`` files of numbers.
 
     Raises:
-        LogError: the file is missing or broken, has no such entry, or its pickle contains anything
-            but a dictionary of arrays of numbers.
+        LogError: the file is missing or broken, lacks the entry, or its pickle is not a dictionary
+            of numeric arrays.
     """
     try:
         size = path.stat().st_size
@@ -144,9 +144,9 @@ def _read_object(entry: IO[bytes]) -> Any:
 class _Unpickler(pickle.Unpickler):
     """Reads the components of an array without building any object.
 
-    A pickle names functions of any module and calls them. Here NumPy's own names are mapped to the
-    classes below, which store their arguments; every other name is rejected. The file can reach no
-    class or function of NumPy.
+    A pickle can call functions of any module by name. Here the names of NumPy are mapped to the
+    classes below, which only store their arguments. All other names are rejected, so the file
+    cannot reach any class or function of NumPy.
     """
 
     def find_class(self, module: str, name: str) -> Any:

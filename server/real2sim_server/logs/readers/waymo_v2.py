@@ -312,7 +312,7 @@ class _WaymoV2Source:
         check_encoded_image(data, where, (lens.width, lens.height))
 
     def check_sweep(self, frame: int) -> int:
-        """Sweeps have no header of their own, so they are read."""
+        """Read the sweep: sweeps have no separate header."""
         return len(self.lidar(frame).points)
 
     def lidar(self, frame: int) -> LidarSweep:

@@ -58,7 +58,7 @@ class Layout(NamedTuple):
         group_start: [G + 1], fields of the same block are neighbours and form a group.
         contact_start: [M + 1], near colliders of each field.
         contact_collider: [T].
-        thin_start: [P + 1], near colliders of each block that its particles touch themselves.
+        thin_start: [P + 1], near colliders of each block with contact of particles.
         thin_collider: [S].
         near: [M] bool, whether contact is possible in this field.
     """

@@ -221,7 +221,7 @@ def _outcome(state: TorchState, params: TorchParameters) -> Callable[[Tensor], T
 # Contact: friction, rebound, impulse.
 
 RUBBER = FixedCorotated(young=2e5, poisson=0.2, viscosity=200)
-"""Damped, so that a block set down on a surface comes to rest and stays in contact."""
+"""Damped material, so that a block placed on a surface comes to rest and stays in contact."""
 
 
 def incline(backend: str, *, duration: float = 5.0) -> list[Check]:
@@ -232,7 +232,7 @@ def incline(backend: str, *, duration: float = 5.0) -> list[Check]:
     for name, mu, lasts in (("slides", math.tan(math.radians(15)), duration), ("sticks", 0.6, 0.5)):
         body = block(RUBBER, size=(0.6, 0.6, 0.3), at=(0, 0, 0.15), friction=mu)
         solver = solve([body], [Plane(name="slope")], gravity=gravity, backend=backend)
-        # Let it settle against the slope first.
+        # The block first settles against the slope.
         solver.step(0.1)
         x, v = solver.measure.centre[0, 0], solver.measure.momentum[0, 0] / solver.measure.mass[0]
         acceleration = max(GRAVITY * (math.sin(slope) - mu * math.cos(slope)), 0.0)

@@ -17,7 +17,7 @@ from ...synthetic import SyntheticConfig, SyntheticLog, generate_log
 # Image metrics: PSNR and SSIM.
 
 PSNR_CAP = 100.0
-"""Stands for the infinite ratio of equal images where ratios are averaged or written [dB]."""
+"""Replaces the infinite PSNR of equal images in means and in files [dB]."""
 SSIM_TAPS, SSIM_SIGMA = 11, 1.5
 SSIM_K1, SSIM_K2 = 0.01, 0.03
 
@@ -43,7 +43,7 @@ def ssim(image: NDArray[np.uint8], truth: NDArray[np.uint8]) -> float:
 
     Wang et al. 2004, eq. 13, with their Gaussian window of 11 taps and sigma 1.5 px, on each
     channel and averaged over all pixels and channels. Outside the image everything is zero, as
-    in the evaluation of Kerbl et al. 2023, so that figures compare with published ones.
+    in the evaluation of Kerbl et al. 2023, so results are comparable with published ones.
     """
     import cv2
 
@@ -75,7 +75,7 @@ def mean_psnr(values: Iterable[float]) -> float:
 # Ground truth: a synthetic log's street can be rebuilt.
 
 SAME_DB = 30.0
-"""Minimum PSNR of a rebuilt street against the logged image [dB]; JPEG compression stays above."""
+"""Minimum PSNR of a rebuilt street against the logged image [dB]. JPEG artefacts stay above it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,8 +94,8 @@ class Truth:
 def find_truth(log: DrivingLog) -> Truth:
     """The street of a synthetic log, built again from the config in its provenance.
 
-    Its first image is compared with the logged one, so that logs of another version of the
-    generator, or altered ones, are not measured against a street that they do not show.
+    The first rendered image is compared with the logged one. This detects altered logs and logs of
+    another generator version, which show a different street.
 
     Raises:
         LogError: the first image cannot be read.
@@ -119,27 +119,27 @@ def find_truth(log: DrivingLog) -> Truth:
 
 # Completeness of vehicles: orbit views of each vehicle against the truth.
 #
-# An edited vehicle is visible from poses that no camera of the log had. Its appearance there was
-# never measured; it comes from the mirrored side and from the vehicle's own frames over time.
+# An edit can show a vehicle from sides that no logged camera saw. Their appearance comes from the
+# mirrored side and from other frames of the vehicle.
 
 AZIMUTHS = 8
-"""Views around a vehicle, the first one from ahead of it."""
+"""Number of views around a vehicle. The first one looks at its front."""
 WIDTH, HEIGHT = 320, 240
 HALF_VIEW = np.deg2rad(25.0)
 ELEVATION = np.deg2rad(12.0)
 SEEN_WITHIN = np.deg2rad(40.0)
-"""A side counts as seen when the azimuth of a logged camera differs by no more than this."""
+"""Largest azimuth difference to a logged camera at which a side counts as seen [rad]."""
 MIN_PIXELS = 500
-"""Views that show fewer pixels of the vehicle, as other things hide it, do not count."""
+"""Minimum number of visible pixels of a vehicle for a view to count."""
 
 
 @dataclass(frozen=True)
 class SideScore:
-    """One view of one vehicle against the truth, over the pixels that truly show it.
+    """One view of one vehicle against the truth, over the pixels that show it in the truth.
 
     Attributes:
-        object_id: of the vehicle.
-        azimuth: of the camera about the vehicle [rad], 0 in front, pi behind.
+        object_id: id of the vehicle.
+        azimuth: azimuth of the camera about the vehicle [rad], 0 in front, pi behind.
         seen: whether a camera of the log saw this side.
         psnr: [dB]; missing pixels count as black.
         coverage: fraction of the pixels with a rendered part of the vehicle.
@@ -172,9 +172,9 @@ class AroundScore:
 def evaluate_around(
     scene: Scene, truth: SyntheticLog, *, least_views: int = 5, backend: str = "auto"
 ) -> AroundScore:
-    """Render every vehicle that the log shows in ``least_views`` images from all around.
+    """Render every vehicle visible in at least ``least_views`` logged images from all sides.
 
-    Each is rendered at the middle of its time, alone, from eight azimuths.
+    Each vehicle is rendered alone, at the middle of its time span, from eight azimuths.
     """
     sides: list[SideScore] = []
     for index, track in enumerate(truth.tracks):

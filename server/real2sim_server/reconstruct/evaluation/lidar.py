@@ -26,13 +26,13 @@ from .rendering import render_logged_view
 # Rendered depth against the LiDAR.
 
 NEAR, FAR = 0.5, 80.0
-"""Points at other depths are not compared [m]."""
+"""Depth range of the compared points [m]."""
 HIDDEN_BEHIND = 0.3
 """An occluder is nearer than a point by at least this much, plus the recession of the road [m]."""
 REACH = 0.006
 """Radius of the search for occluders on the image [rad]; about two beams apart."""
 ROAD_BELOW = 1.2
-"""The road is at least so far below the cameras [m]."""
+"""Minimum height of the cameras above the road [m]."""
 
 
 def seen_points(
@@ -40,10 +40,10 @@ def seen_points(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
     """Rows [M], columns [M] and depths [M] [m] of the points that the camera can see.
 
-    The LiDAR is at another position than the camera and sees over objects that occlude others. A
-    point counts as hidden when any point within REACH of it on the image is nearer by more than
-    HIDDEN_BEHIND plus the recession of a road ROAD_BELOW the camera over that distance, z^2 angle /
-    height. The second term keeps distant stretches of road.
+    The LiDAR has a different position and sees points that the camera does not. A point counts as
+    hidden if any point within REACH on the image is nearer by more than HIDDEN_BEHIND plus the
+    recession z^2 angle / height of a road ROAD_BELOW the camera. The second term keeps distant
+    stretches of road.
 
     Args:
         points: [N, 3] in the camera frame [m].
@@ -72,12 +72,12 @@ def seen_points(
 def depth_errors(depth: NDArray[np.float32], points: Float, camera: Camera) -> NDArray[np.float64]:
     """Absolute errors [M] [m] of a rendered depth image at the points the camera can see.
 
-    Infinite where nothing was rendered, so that holes count and a median stays honest.
+    Infinite where nothing was rendered, so that a median accounts for holes.
 
     Args:
-        depth: [H, W] along the camera's z [m], 0 where nothing is.
+        depth: [H, W] along the camera's z [m], 0 in empty pixels.
         points: [N, 3] in the camera frame [m].
-        camera: of the image.
+        camera: camera of the image.
     """
     row, column, expected = seen_points(points, camera)
     rendered = depth[row, column].astype(np.float64)
@@ -100,9 +100,9 @@ def mean_error(errors: NDArray[np.float64]) -> float:
 
 
 def error_p90(errors: NDArray[np.float64]) -> float:
-    """90th percentile [m]: the smallest error that nine of ten do not exceed.
+    """90th percentile [m].
 
-    Nan for no points, infinite where more than a tenth are holes.
+    Nan without points, infinite if more than a tenth of them are holes.
     """
     if len(errors) == 0:
         return float("nan")
@@ -114,7 +114,7 @@ def error_p90(errors: NDArray[np.float64]) -> float:
 # reconstruction report; :mod:`.scores` holds the full evaluation).
 
 COVERAGE_NEAR = 0.5
-"""LiDAR points nearer to the camera plane do not count as covering [m]."""
+"""Minimum depth of LiDAR points that count as coverage [m]."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ class CoverageScore:
     """One rendered view against its logged image.
 
     Attributes:
-        camera, frame: of the view.
+        camera, frame: camera and frame of the view.
         psnr: over all pixels [dB].
         psnr_lidar: over the pixels that LiDAR covers [dB]; nan without such pixels.
         lidar_fraction: fraction of pixels that LiDAR covers, 0 to 1.
@@ -140,7 +140,7 @@ class CoverageReport:
     """Scores of several views.
 
     Attributes:
-        views: one score each, camera by camera within a frame.
+        views: one score per view, by frame, then by camera.
         psnr, psnr_lidar: means of the views' values [dB].
     """
 
@@ -160,16 +160,16 @@ def evaluate_views(
 ) -> CoverageReport:
     """Render logged views and compare them with the logged images.
 
-    A pixel counts as covered by LiDAR when a point of that frame's own sweep, at least
-    COVERAGE_NEAR in front of the camera, projects into it or into a pixel up to 1/600 of the image
-    width away (2 px at 1242 px). There is no occlusion test.
+    LiDAR covers a pixel if a point of the frame's sweep, at least COVERAGE_NEAR in front of the
+    camera, projects to within 1/600 of the image width (2 px at 1242 px). There is no occlusion
+    test.
 
     Args:
         scene: reconstructed from ``log``.
         frames: indices of frames.
         cameras: names; all by default.
-        width: of the compared images [px]; the logged width by default.
-        backend: of the renderer.
+        width: width of the compared images [px]; the logged width by default.
+        backend: backend of the renderer.
 
     Raises:
         ReconstructError: no frames or no cameras were named, or the scene lacks a frame.
@@ -232,7 +232,7 @@ def _mean_coverage(values: list[float]) -> float:
 
 CHAMFER = "mean squared distance from cast to true points plus from true to cast points"
 F_DISTANCE = 0.05
-"""Points nearer than this agree [m]."""
+"""Maximum distance between matching points for the F score [m]."""
 
 
 @dataclass(frozen=True)
@@ -240,17 +240,17 @@ class SweepScore:
     """One sweep, or means over several.
 
     Attributes:
-        frame: of the log; -1 for means.
+        frame: frame of the log; -1 for means.
         rays: number of compared rays.
         median_m, median_squared_m2, p90_m: absolute error of the range where both return.
         expected_m: median absolute error of the mean range of the light, which reveals haze.
         chamfer_m2: see CHAMFER.
         f_score: share of points within 5 cm of the other cloud, mean of both directions.
-        hit_miss: share of rays with the right answer to whether they hit anything. For a recorded
-            sweep, where all rays returned, the share that hit.
-        intensity_rmse: of the reflectivity where both return.
-        drop_accuracy: share of rays with the right answer to whether they return; nan if the lost
-            rays are unknown.
+        hit_miss: share of rays with a correct hit or miss. For a recorded sweep, where all rays
+        returned, the share that hit.
+        intensity_rmse: root mean square error of the reflectivity where both return.
+        drop_accuracy: share of rays whose return or loss is predicted correctly; nan if the lost
+        rays are unknown.
     """
 
     frame: int
@@ -274,8 +274,8 @@ class LidarScore:
         against: ``ray-cast truth`` or ``recorded returns``.
         chamfer: convention of the distance between two clouds.
         mean: over all sweeps.
-        sweeps: one score each.
-        ring_residual_deg: of the fitted beam table; nan if none was fitted.
+        sweeps: one score per sweep.
+        ring_residual_deg: residual of the fitted beam table [deg]; nan without one.
     """
 
     against: str
@@ -286,10 +286,10 @@ class LidarScore:
 
 
 def evaluate_sweeps(scene: Scene, log: DrivingLog, frames: Sequence[int]) -> LidarScore | None:
-    """Cast the sweeps of ``frames``; None if the log has no sweeps.
+    """Cast the sweeps of ``frames`` and score them; None if the log has no sweeps.
 
     Sweeps of synthetic logs are compared with rays cast into their street, without noise and
-    losses; other sweeps with their recorded returns.
+    losses. Other sweeps are compared with their recorded returns.
 
     Raises:
         LogError: a sweep cannot be read.
@@ -355,7 +355,7 @@ def _against_street(
 
 
 def _returned(lidar: Lidar, azimuth: Float, elevation: Float) -> NDArray[np.bool_]:
-    """Which rays of a grid are among recorded ones: nearest row and column."""
+    """Mask of the rays of a grid that were recorded, by nearest row and column."""
     beams = lidar.beams
     rows = np.argsort(beams.elevation[:, 0])
     heights = beams.elevation[rows, 0]
@@ -402,7 +402,7 @@ def _against_returns(
 
 
 def _kept(echo: Echo, lidar: Lidar) -> NDArray[np.bool_]:
-    """Rays that return more likely than not."""
+    """Rays with a return probability above one half."""
     return echo.hit & (drop_probability(echo, lidar) <= 0.5)
 
 

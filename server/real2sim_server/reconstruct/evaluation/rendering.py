@@ -22,7 +22,7 @@ from ..training.data import held_out_frames
 
 
 def scene_instances(scene: Scene, t_us: int) -> list[Instance]:
-    """Background and all objects that exist at ``t_us``, where they were recorded."""
+    """Background and all objects that exist at ``t_us``, at their recorded poses."""
     instances = [Instance(scene.background)]
     for index, item in enumerate(scene.objects.values()):
         if item.trajectory.covers(t_us):
@@ -105,7 +105,7 @@ class RenderRate:
         frames_per_second: camera images per second, colour only, all cameras in one call: number
             of cameras divided by the median duration of a call.
         cameras: number of cameras.
-        seconds: of each measured call.
+        seconds: duration of each measured call.
     """
 
     frames_per_second: float
@@ -165,9 +165,9 @@ class SelectedFrames:
 def select_frames(scene: Scene, log: DrivingLog, frames: str | Sequence[int]) -> SelectedFrames:
     """The selected frames.
 
-    ``held-out`` selects the frames that training held out, as listed in the scene's provenance. A
-    scene that lists none (built without training, on all frames, or elsewhere) is compared at every
-    fourth frame by the same rule, 2, 6, 10 ..., and these do not count as held out.
+    ``held-out`` selects the frames that training held out, as listed in the scene's provenance.
+    Scenes without such a list (untrained, trained on all frames, or imported) are compared at
+    frames 2, 6, 10, ..., which do not count as held out.
 
     Args:
         frames: ``held-out``, ``all``, or indices.
@@ -192,7 +192,7 @@ def select_frames(scene: Scene, log: DrivingLog, frames: str | Sequence[int]) ->
 
 
 def select_cameras(scene: Scene, log: DrivingLog, width: int | None) -> tuple[Camera, ...]:
-    """The log's cameras, calibrated as the scene has them, at ``width`` or as logged [px].
+    """The log's cameras with the scene's calibration, at ``width`` or the logged width [px].
 
     Raises:
         ReconstructError: the scene lacks one of them.

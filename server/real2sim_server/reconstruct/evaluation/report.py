@@ -27,13 +27,13 @@ from .shifted import true_view
 # Images for visual comparison: errors and depth in colour, crops of moving objects.
 
 ERROR_FULL = 64.0
-"""Error at the end of the colour scale of error images, of 255."""
+"""Maximum of the colour scale of error images, in 8-bit levels."""
 DEPTH_NEAR, DEPTH_FAR = 2.0, 80.0
-"""Ends of the logarithmic colours of depth images [m]."""
+"""Range of the logarithmic colour scale of depth images [m]."""
 CROP_MARGIN = 0.15
-"""Crops reach so far beyond the outline of a box, as a fraction of its size."""
+"""Margin of crops around the outline of a box, as a fraction of its size."""
 MIN_CROP = 12
-"""Objects that are smaller on the image are not shown [px]."""
+"""Minimum size on the image of the objects shown [px]."""
 
 Image = NDArray[np.uint8]
 
@@ -47,7 +47,7 @@ def error_image(image: Image, truth: Image) -> Image:
 
 
 def depth_image(depth: NDArray[np.float32]) -> Image:
-    """[H, W, 3] of a depth image [H, W] [m]: near is red, far is blue, black where nothing is."""
+    """[H, W, 3] of a depth image [H, W] [m]: near is red, far is blue, empty is black."""
     import cv2
 
     near, far = np.log(DEPTH_NEAR), np.log(DEPTH_FAR)
@@ -60,8 +60,8 @@ def object_crops(
 ) -> list[tuple[str, tuple[slice, slice]]]:
     """Id and rows and columns of at most ``limit`` moving objects, the largest on the image first.
 
-    An object needs at least half of its outline's bounding box on the image, and a centre that no
-    other object occludes.
+    At least half of the outline's bounding box must be on the image, and no other object may
+    occlude the centre.
     """
     t_us = image_time(log, camera.name, frame)
     T_camera_world = camera.viewmat(log.ego.transform(t_us))

@@ -59,12 +59,12 @@ class EvaluateOptions:
 
     Attributes:
         frames: ``held-out``, ``all`` or indices; see :func:`.rendering.select_frames`.
-        width: of the compared images [px]; as logged by default.
+        width: width of the compared images [px]; as logged by default.
         shifts: lateral distances from the recorded path [m]. Whole images are compared if truth
-            exists, the road by LiDAR and other images on every log.
-        shifted_frames: maximum number of frames rendered from there, evenly spread.
+        exists. The road is compared on every log, by LiDAR and other images.
+        shifted_frames: maximum number of frames rendered from shifted poses, evenly spread.
         repeats: timed renders.
-        backend: of the renderer.
+        backend: backend of the renderer.
         around: whether to render vehicles from all sides, if truth exists.
         lidar: whether to cast and compare LiDAR sweeps, if the log has any.
 
@@ -97,7 +97,7 @@ class LoggedViewScore:
     """One rendered view against its logged image.
 
     Attributes:
-        camera, frame: of the view.
+        camera, frame: camera and frame of the view.
         psnr: over all pixels [dB]; infinite for equal images.
         ssim: structural similarity, at most 1.
         psnr_objects: over the pixels within the boxes of moving objects [dB]; nan below 50 pixels.
@@ -151,9 +151,9 @@ class Evaluation:
         box_error_m: median distance between the centres of moving objects and of the log's boxes
             over all their times [m]; nan if the log has none of the scene's objects.
         frames_per_second: camera images rendered per second, see :class:`.rendering.RenderRate`.
-        width, height: of the first camera's compared image [px].
+        width, height: size of the first camera's compared image [px].
         by_camera: the same per camera.
-        views: one score each, camera by camera within a frame.
+        views: one score per view, by frame, then by camera.
         shifted: views shifted from the path; empty without truth.
         no_shifted: the reason why it is empty; empty otherwise.
         lane_band: the road seen from shifted poses, against its appearance in other images.
@@ -272,7 +272,7 @@ def evaluate_scene(
 def logged_pair(
     scene: Scene, log: DrivingLog, camera: Camera, frame: int, backend: str
 ) -> tuple[NDArray[np.uint8], Frame]:
-    """The logged image at the size of ``camera``, and the view that the scene shows.
+    """The logged image at the size of ``camera``, and the rendered view.
 
     Raises:
         LogError: the image cannot be read.

@@ -138,7 +138,7 @@ def within_an_object(log: DrivingLog, position: Float, t_us: int) -> bool:
 def _depth_errors(
     depth: NDArray[np.float32], true_depth: NDArray[np.float32]
 ) -> NDArray[np.float64]:
-    """At every DEPTH_STRIDE-th pixel that shows something; infinite where nothing is rendered."""
+    """Depth errors at every DEPTH_STRIDE-th pixel with a surface; infinite if none is rendered."""
     rendered = depth[::DEPTH_STRIDE, ::DEPTH_STRIDE].astype(np.float64)
     expected = true_depth[::DEPTH_STRIDE, ::DEPTH_STRIDE].astype(np.float64)
     errors = np.where(rendered > 0, np.abs(rendered - expected), np.inf)
@@ -164,14 +164,14 @@ def _score(shift: float, compared: list[_Compared], total: int) -> ShiftScore:
 # next lane. Only these pixels are compared.
 
 COLOURED_WITHIN = (4.0, 12.0)
-"""Depth range of images that colour the road [m]."""
+"""Depth range in which images provide the road's colours [m]."""
 COMPARED_WITHIN = (5.0, 25.0)
-"""And is compared at these [m]."""
+"""Depth range in which the road is compared [m]."""
 ON_ROAD = 0.1
-"""Points so near to the ground are of the road [m]."""
+"""Maximum distance of road points from the ground [m]."""
 MAX_FRAMES = 60
 MIN_PIXELS = 100
-"""Views with fewer pixels do not count."""
+"""Minimum number of compared pixels for a view to count."""
 
 
 @dataclass(frozen=True)
@@ -216,8 +216,8 @@ def evaluate_lane_band(
     """Move the recording vehicle ``shifts`` [m] to its left and to its right; compare the road.
 
     Args:
-        camera: at the size that is compared.
-        frames: from whose times views are taken.
+        camera: at the compared size.
+        frames: their times are rendered.
 
     Raises:
         LogError: images or sweeps that cannot be read.
@@ -274,7 +274,7 @@ def _psnr(image: NDArray[np.uint8], place: NDArray[np.int64], colours: Float) ->
 
 
 def road_colours(log: DrivingLog, camera: Camera, ground: Ground) -> RoadColours:
-    """The road as the images of ``camera`` show it from near by, outside of all boxes."""
+    """The road as seen at close range in the images of ``camera``, outside all boxes."""
     near, far = COLOURED_WITHIN
     points, colours = [np.zeros((0, 3))], [np.zeros((0, 3), np.float32)]
     for frame in range(0, log.frame_count, -(-log.frame_count // MAX_FRAMES)):
@@ -284,7 +284,7 @@ def road_colours(log: DrivingLog, camera: Camera, ground: Ground) -> RoadColours
         boxed = tracks_mask(log.tracks, camera, pose, t_us)
         chosen = (depth > near) & (depth < far) & ~boxed[row, column]
         row, column, depth = row[chosen], column[chosen], depth[chosen]
-        # Colours are those of whole pixels: their middles are put onto the ground.
+        # Colours are sampled at pixel centres, which are projected onto the ground.
         pixel = np.stack([column + 0.5, row + 0.5, np.ones(len(row))], axis=1)
         local = depth[:, None] * (pixel @ np.linalg.inv(camera.K).T)
         world = apply_transform(pose, local)

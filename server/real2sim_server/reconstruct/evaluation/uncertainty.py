@@ -34,16 +34,16 @@ from .rendering import (
 # pixels with respect to these colours are therefore, for each Gaussian, the sum of its blending
 # weights and the sum of weights times residuals. Their quotient over the training views is the
 # mean residual of the rays that hit the Gaussian. A prior of a few hundredths of a pixel with the
-# value UNSEEN covers Gaussians without hits. Rendered as a colour, it ranks the true errors of new
-# images better than ray counts do, which ignore thin, shiny and moving surfaces (figures in
-# docs/reconstruction.md).
+# value UNSEEN covers Gaussians without hits. Rendered as a colour, this residual ranks the true
+# errors of new images better than ray counts do, because it accounts for thin, shiny and moving
+# surfaces (figures in docs/reconstruction.md).
 
 VIEWS = 48
-"""Training views that are looked at, at most."""
+"""Maximum number of training views used."""
 WIDTH = 640
 """Maximum width of the images [px]."""
 PRIOR_PIXELS, PRIOR_WIDTH = 0.05, 240
-"""Rays that UNSEEN counts for: pixels of an image of that width [px]."""
+"""Weight of the prior UNSEEN: pixels of an image of that width [px]."""
 
 
 @dataclass(frozen=True)
@@ -97,10 +97,10 @@ def fit_uncertainties(
     Held-out frames are not used.
 
     Args:
-        scene: made from ``log``.
+        scene: scene made from ``log``.
         log: the same part of it.
         views: maximum number of images, evenly spread over all of them.
-        backend: of the renderer; it must support gradients.
+        backend: backend of the renderer; it must support gradients.
         on_view: called with the number of finished views and of all views.
 
     Raises:
@@ -216,7 +216,7 @@ def _with(scene: Scene, sums: list[_Sums], sky: _Sums | None, prior: float) -> S
 # Check: rendered uncertainty against true errors.
 
 Values = NDArray[np.float32]
-"""An image [H, W], or a part of one."""
+"""An image [H, W] or a crop."""
 BLUR = 9
 """Edge of the squares for the comparison of local means [px]."""
 MAX_VIEWS = 24
@@ -228,7 +228,7 @@ class UncertaintyScore:
 
     Attributes:
         spearman: rank correlation of uncertainty and absolute error, per pixel.
-        spearman_regions: of their means over squares of 9 by 9 pixels.
+        spearman_regions: rank correlation of their means over squares of 9 by 9 pixels.
         sparsification: remaining error above the minimum when the most uncertain pixels are
             dropped, over all dropped shares: 0 if uncertainty ranks like the error itself, 1 if it
             ranks at random.
@@ -255,10 +255,10 @@ def evaluate_uncertainty(
     """Compare rendered uncertainty with errors; None if the scene has no uncertainties.
 
     Args:
-        scene: with uncertainties.
+        scene: scene with uncertainties.
         log: the log that the scene was made from.
         views: cameras and frames, of which at most MAX_VIEWS, evenly spread, are used.
-        backend: of the renderer.
+        backend: backend of the renderer.
 
     Raises:
         LogError: an image cannot be read.
@@ -321,7 +321,7 @@ def _left(ordered: Values) -> Float:
 def _images(
     scene: Scene, log: DrivingLog, camera: Camera, frame: int, backend: str
 ) -> tuple[Values, Values]:
-    """Drawn uncertainty and true error [H, W]."""
+    """Rendered uncertainty and true error [H, W]."""
     t_us = image_time(log, camera.name, frame)
     image = resized(log.image(camera.name, frame), camera)
     drawn = render_logged_view(scene, camera, t_us, backend=backend)

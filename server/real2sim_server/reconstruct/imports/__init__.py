@@ -1,4 +1,4 @@
-"""Checkpoints of other systems as scenes. Nothing in a checkpoint is ever executed."""
+"""Import of checkpoints of other systems as scenes. Code in a checkpoint is never executed."""
 
 from __future__ import annotations
 

@@ -49,7 +49,7 @@ def read_torch_file(path: Path) -> Any:
     Raises:
         TorchFileError: not a torch file, damaged, with other objects, or reading it takes more
             memory or time than its size justifies.
-        OSError: it cannot be read.
+            OSError: the file cannot be read.
     """
     size = path.stat().st_size
     with tempfile.TemporaryDirectory(prefix="real2sim-") as folder:
@@ -91,7 +91,7 @@ def unpack_torch_file(path: str, folder: str) -> Any:
             "reading them would run code from the file. Save it again with tensors only, in the "
             "program it comes from"
         ) from error
-    # Damage shows as almost any error, depending on where it is.
+    # A damaged file can raise almost any error.
     except Exception as error:
         raise TorchFileError(f"no checkpoint of torch, or damaged: {error}") from error
     tensors: dict[str, Tensor] = {}
@@ -148,7 +148,7 @@ def _numpy_scalars() -> list[Any]:
 def _unsafe_objects(path: str) -> list[str]:
     try:
         return sorted(torch.serialization.get_unsafe_globals_in_checkpoint(path))
-    except Exception:  # the file may be of an old kind, or no checkpoint at all
+    except Exception:  # the file may have an old format, or not be a checkpoint at all
         return []
 
 
@@ -164,20 +164,20 @@ class CheckpointOptions:
     """Training data of a checkpoint, from its configuration.
 
     Attributes:
-        dataset: preprocessed dataset folder used in training. Street Gaussians requires it: its
-            checkpoints hold corrections of tracks, not tracks. For drivestudio it provides the
-            cameras and the ego path; without it the ego does not move.
+        dataset: preprocessed dataset folder used in training. Required for Street Gaussians,
+        whose checkpoints hold only corrections of tracks. For drivestudio it provides the
+        cameras and the ego path; without it the ego does not move.
         first_frame, last_frame: training frames, both inclusive (``selected_frames`` of Street
             Gaussians; ``start_timestep`` of drivestudio is the first). The last one defaults to
             the end.
         cameras: training cameras. Default: 0, 1, 2 for Street Gaussians, as in its code; all
             cameras in the folder for drivestudio.
         tracker: whether Street Gaussians used tracks from a tracker (``use_tracker``).
-        fourier_scale: of Street Gaussians' time-varying colours.
-        frame_rate: of a drivestudio log [Hz]; its checkpoints contain no times.
-        world: of a drivestudio checkpoint: axes of its world. ``vehicle`` (x forward, z up) for
+        fourier_scale: scale of Street Gaussians' time-varying colours.
+        frame_rate: frame rate of a drivestudio log [Hz]; checkpoints contain no times.
+        world: world axes of a drivestudio checkpoint. ``vehicle`` (x forward, z up) for
             Waymo, Argoverse and KITTI, ``front_camera`` (x right, y down) for nuScenes.
-        name: of the scene; default: the name of the dataset folder, otherwise of the file.
+        name: name of the scene; by default the dataset folder's, otherwise the file's.
     """
 
     dataset: Path | None = None
@@ -240,7 +240,7 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
 
 
 def table(path: Path, state: Mapping[str, Any], key: str) -> Mapping[str, Any]:
-    """The table under ``key``. Raises CheckpointError where it is missing or none."""
+    """The table under ``key``. Raises CheckpointError if it is missing or not a table."""
     value = state.get(key)
     if not isinstance(value, Mapping):
         found = ", ".join(sorted(map(str, state))[:12]) or "nothing"
@@ -255,7 +255,7 @@ def array(
     """A tensor of ``part`` as float64.
 
     Args:
-        path, what: for messages.
+        path, what: file and name of the tensor, for messages.
         part: table with the tensor.
         key: its name.
         shape: expected shape, None for any size.
@@ -382,7 +382,7 @@ def read_json(path: Path) -> Mapping[str, Any]:
 
 
 def image_size(folder: Path, camera: int) -> tuple[int, int] | None:
-    """Width and height [px] of a camera's images, None where there are none.
+    """Width and height [px] of a camera's images, None without images.
 
     Raises:
         CheckpointError: for an image that is neither PNG nor JPEG.
@@ -408,8 +408,8 @@ def sky_from_opengl_cube(faces: Float, R_cube_world: Float) -> Sky:
 
     Args:
         faces: [6, R, R, 3] RGB, faces +x -x +y -y +z -z of OpenGL.
-        R_cube_world: [3, 3] rotation of world directions to those of the cube. Where it only
-            exchanges axes, every pixel is moved and none is interpolated.
+        R_cube_world: [3, 3] rotation of world directions to those of the cube. A rotation that
+        only exchanges axes moves pixels without interpolation.
     """
     directions = face_directions(faces.shape[1]).astype(np.float64) @ R_cube_world.T
     face, row, column = _nearest_pixel(directions, faces.shape[1])

@@ -1,7 +1,7 @@
 """Checkpoints of drivestudio (OmniRe and others), ``checkpoint_final.pth``.
 
-Facts: github.com/ziyc/drivestudio, models/nodes, models/gaussians/vanilla.py, models/modules.py and
-datasets.
+Source: github.com/ziyc/drivestudio (models/nodes, models/gaussians/vanilla.py, models/modules.py,
+datasets).
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from .checkpoint import (
 )
 
 R_CUBE_WORLD = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
-"""Turn of view directions before its sky is looked up."""
+"""Rotation of view directions for the lookup in drivestudio's sky."""
 
 FLAT = 1e-4
 """Thickness of flat Gaussians, which have only two scales, as a fraction of the smaller scale."""
@@ -101,7 +101,7 @@ def import_drivestudio(
 
 
 def _frame_count(file: Path, models: Mapping[str, Any], options: CheckpointOptions) -> int:
-    """Frames of the clip: from the objects, otherwise from the options, otherwise two."""
+    """Number of frames: from the objects, otherwise from the options, otherwise two."""
     asked = None if options.last_frame is None else options.last_frame - options.first_frame + 1
     if "RigidNodes" not in models:
         return asked or 2
@@ -117,7 +117,7 @@ def _frame_count(file: Path, models: Mapping[str, Any], options: CheckpointOptio
 
 
 def _cloud(file: Path, models: Mapping[str, Any], key: str) -> GaussianCloud:
-    """All Gaussians of one model, in the frames they are in."""
+    """All Gaussians of one model, in the frames of the checkpoint."""
     part = table(file, models, key)
     means = array(file, key, part, "_means", (None, 3))
     n = len(means)
@@ -137,7 +137,7 @@ def _cloud(file: Path, models: Mapping[str, Any], key: str) -> GaussianCloud:
 
 
 def _log_scales(file: Path, key: str, part: Mapping[str, Any], n: int) -> Float:
-    """Three log scales; balls in the file have one, discs two."""
+    """Three log scales. Spheres in the file have one, discs two."""
     given = array(file, key, part, "_scales", (n, None))
     match given.shape[1]:
         case 3:
@@ -169,7 +169,7 @@ class _Instances:
     def object(
         self, instance: int, times_us: NDArray[np.int64], T_scene_file: Float
     ) -> SceneObject | None:
-        """One of them, or None without Gaussians or frames. Raises SceneError for bad values."""
+        """One object, or None without Gaussians or frames. Raises SceneError for bad values."""
         frames = np.flatnonzero(self.visible[:, instance])
         mine = self.owner == instance
         if not (len(frames) and mine.any()):
@@ -295,8 +295,8 @@ def _rig(folder: Path, options: CheckpointOptions) -> CameraRig:
     if not cameras:
         raise CheckpointError(f"{folder / 'extrinsics'}: holds no cameras such as 0.txt")
     poses = {c: read_pose(folder / "extrinsics" / f"{c}.txt") for c in cameras}
-    # Waymo's extrinsics are of cameras that look along x, all others' of OpenCV cameras. The first
-    # camera looks ahead in all of them.
+    # Waymo's cameras look along x, all others follow OpenCV. The first camera looks ahead in every
+    # layout.
     ahead = read_pose(folder / "extrinsics" / f"{found[0]}.txt")[0, :3] if found else np.zeros(3)
     T_camera_optical = T_VEHICLE_OPTICAL if ahead[0] > ahead[2] else np.eye(4)
     try:

@@ -243,7 +243,7 @@ def _seen_by(file: Path, seen: Mapping[str, Any], row: _TrackRow) -> set[int]:
 def _deal_columns(
     rows: list[_TrackRow], frames: StreetFolder
 ) -> tuple[NDArray[np.int64], Float, Float]:
-    """Each row gets the first free column of its frame, in file order."""
+    """Assign each row to the first free column of its frame, in file order."""
     count = len(frames.times_us)
     inside = [r for r in rows if 0 <= r.frame - frames.first_frame < count]
     per_frame = np.bincount([r.frame - frames.first_frame for r in inside], minlength=count)
@@ -268,7 +268,7 @@ def _moves(ids: NDArray[np.int64], positions: Float, ego: Float, track: int) -> 
 def _close_gaps(
     ids: NDArray[np.int64], positions: Float, headings: Float
 ) -> tuple[NDArray[np.int64], Float, Float]:
-    """Move tracks to the first columns, but only if that saves columns: so it was trained."""
+    """Move tracks to the first columns, but only if that saves columns, as in training."""
     used = int((ids != EMPTY).sum(axis=1).max(initial=0))
     if used == ids.shape[1]:
         return ids, positions, headings
@@ -344,7 +344,7 @@ def import_street_gaussians(
 
 
 def _check_tracks(file: Path, state: Mapping[str, Any], tracks: StreetTracks) -> None:
-    """The models in the file must be those of the tracks, else nothing fits together."""
+    """Check that the models in the file match the tracks."""
     held = {key for key in state if str(key).startswith("obj_")}
     expected = {model_name(t) for t in tracks.track_ids}
     if held != expected:

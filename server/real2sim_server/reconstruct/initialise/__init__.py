@@ -1,1 +1,1 @@
-"""Stage 0: from a log to a scene of Gaussians without training."""
+"""Stage 0: builds a scene of Gaussians from a log without training."""

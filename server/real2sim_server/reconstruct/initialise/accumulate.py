@@ -40,7 +40,7 @@ class PointSet:
         return len(self.points)
 
     def select(self, index: NDArray[np.bool_] | NDArray[np.int64]) -> PointSet:
-        """The points picked by a mask or by indices."""
+        """The points selected by a mask or by indices."""
         return PointSet(self.points[index], self.intensity[index], self.weight[index])
 
     @classmethod
@@ -93,7 +93,7 @@ def thin(cloud: PointSet, voxel: float, levels: NDArray[np.int64] | None = None)
 def thin_to(
     cloud: PointSet, voxel: float, limit: int, levels: NDArray[np.int64] | None = None
 ) -> PointSet:
-    """Like :func:`thin`, with voxels as much larger as it takes to stay within ``limit`` points."""
+    """Like :func:`thin`, with voxels enlarged to stay within ``limit`` points."""
     thinned = thin(cloud, voxel, levels)
     while len(thinned) > limit:
         # Points are on surfaces, so their number falls with the square of the edge.
@@ -113,7 +113,7 @@ def _voxel_keys(
 
 
 def _group(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Stable order that brings equal keys together, and where each group starts."""
+    """Stable order that groups equal keys, and the start of each group."""
     order = np.argsort(keys, kind="stable")
     ordered = keys[order]
     starts = np.flatnonzero(np.concatenate([[True], ordered[1:] != ordered[:-1]]))
@@ -160,17 +160,17 @@ def well_supported(points: NDArray[np.float32], reach: NDArray[np.float32]) -> N
 
 # Walls above the LiDAR's field of view.
 #
-# A spinning LiDAR covers a few degrees upwards, and houses are higher. A wall that reaches the
-# scanner's upper limit is continued straight up; images then decide which part is real.
+# A spinning LiDAR covers only a few degrees above the horizon. Walls that reach its upper limit
+# are continued straight up. Images then decide which part is real.
 
 CELL = 0.25
 """Edge of the columns for the detection of walls [m]."""
 REACH, HEIGHT = 45.0, 14.0
-"""Walls up to this far from the drive are continued by this much [m]."""
+"""Walls within this distance of the drive are continued, and their added height [m]."""
 MIN_POINTS, MIN_EXTENT = 6, 0.8
-"""A column is a wall if it has this many points over at least this height [m]."""
+"""Minimum number of points and minimum height of a wall column [m]."""
 MAX_DEVIATION = 28.0
-"""Views of a real wall differ less than this in brightness, standard deviation of 0 to 255."""
+"""Maximum standard deviation of a real wall's brightness between views, 0 to 255."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,7 +179,7 @@ class ScanLimit:
 
     Attributes:
         path: [P, 3] float64, positions of the vehicle in the world [m].
-        height: of the scanner over the vehicle's origin [m].
+        height: height of the scanner above the vehicle's origin [m].
         slope: tangent of the elevation of its highest ray.
     """
 
@@ -193,7 +193,7 @@ def continue_walls(structure: Surfels, limit: ScanLimit, *, max_count: int) -> S
 
     Args:
         structure: objects above the ground, world frame.
-        limit: of the scanner.
+        limit: highest rays of the scanner.
         max_count: maximum number; the spacing grows if needed.
     """
     columns = _wall_columns(structure, limit)
@@ -271,7 +271,7 @@ def _rise(columns: _Columns, step: float) -> Surfels:
 def real_walls(
     colours: NDArray[np.float32], known: NDArray[np.bool_], deviation: NDArray[np.float32]
 ) -> NDArray[np.bool_]:
-    """Which candidates [N] are walls: seen, alike from all views, and not coloured like a sky.
+    """Mask [N] of candidates that are walls: seen, alike in all views, not coloured like the sky.
 
     Args:
         colours: [N, 3] float32 in [0, 1].
@@ -288,13 +288,13 @@ def real_walls(
 
 HALF_SWEEP_US = 50_000
 EGO_MARGIN = 0.45
-"""Returns this close to the sides of the recording vehicle are its own mirrors [m]."""
+"""Returns this close to the sides of the recording vehicle come from its mirrors [m]."""
 SHELL = 0.3
 """Points above the road this close to a box are dropped [m]: boxes are inexact, and parts of a
 moving vehicle outside its box would leave a smear.
 """
 THIN_EVERY = 6_000_000
-"""Points that may pile up before they are thinned, so that memory does not follow the drive."""
+"""Maximum number of points before thinning. Bounds the memory for long drives."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -302,7 +302,7 @@ class Accumulation:
     """All sweeps of a log.
 
     Attributes:
-        background: thinned points of everything that is in no box, world frame.
+        background: thinned points outside all boxes, world frame.
         objects: by object id, thinned points in the frame of the box (origin at its centre).
         limit: the highest rays of the scanner.
     """
@@ -352,7 +352,7 @@ def accumulate(
 
 
 def _highest_slope(rays: Float) -> float:
-    """Tangent of the elevation that one ray in a thousand exceeds."""
+    """Tangent of the elevation that one ray in a thousand exceeds (99.9th percentile)."""
     return float(np.quantile(rays[:, 2] / np.hypot(rays[:, 0], rays[:, 1]), 0.999))
 
 
@@ -376,7 +376,7 @@ def _thin_background(parts: list[PointSet], path: Float, options: InitialiseOpti
 
 
 def _sweeps(log: DrivingLog) -> Iterator[tuple[int, LidarSweep]]:
-    """All sweeps in order, read one ahead."""
+    """All sweeps in order, prefetched by one."""
     with ThreadPoolExecutor(1) as reader:
         ahead = reader.submit(log.lidar, 0)
         for frame in range(log.frame_count):
@@ -389,7 +389,7 @@ def _sweeps(log: DrivingLog) -> Iterator[tuple[int, LidarSweep]]:
 def _usable(
     sweep: LidarSweep, log: DrivingLog, options: InitialiseOptions
 ) -> tuple[Float, NDArray[np.float32], Float]:
-    """Points, intensities and offsets [us] that are within range and not on the vehicle itself."""
+    """Points, intensities and offsets [us] within range and not on the recording vehicle."""
     points = sweep.points.astype(np.float64)
     near = np.linalg.norm(points - sweep.origin, axis=1) < options.max_range
     on_vehicle = on_recording_vehicle(points, log.ego_size)
@@ -398,7 +398,7 @@ def _usable(
 
 
 def on_recording_vehicle(points: Float, size: tuple[float, float, float]) -> NDArray[np.bool_]:
-    """Mask [N] of points [N, 3] in the vehicle's frame that are returns from its own body."""
+    """Mask [N] of the points [N, 3] (vehicle frame) on the vehicle's body."""
     length, width, height = size
     return (
         (points[:, 0] > -0.3 * length)
@@ -411,7 +411,7 @@ def on_recording_vehicle(points: Float, size: tuple[float, float, float]) -> NDA
 
 _BACKGROUND, _DROPPED = -1, -2
 ROAD_BAND = 0.05
-"""Points in a box at most so high over its bottom are road [m]."""
+"""Maximum height of road points above the bottom of a box [m]."""
 
 
 def _assign(
@@ -443,7 +443,7 @@ def _assign(
 def near_box(
     in_world: Float, offset_us: Float, track: ObjectTrack, t_us: int
 ) -> tuple[NDArray[np.int64], Float]:
-    """Indices of points near the box and their coordinates in it when they were measured."""
+    """Indices of points near the box, and their coordinates in it at their times of measurement."""
     centre = track.trajectory.pose(t_us)[0]
     velocity = track.trajectory.velocity(t_us)
     reach = np.linalg.norm(track.size) / 2 + SHELL + np.linalg.norm(velocity) * 0.1
@@ -453,7 +453,7 @@ def near_box(
         invert_transform(pose_around(track.trajectory, t_us + sign * HALF_SWEEP_US))
         for sign in (-1, 1)
     )
-    # Within half a turn of the scanner the path of a point in the box is straight to a millimetre.
+    # Within half a turn of the scanner, a point's path in the box is straight to a millimetre.
     fraction = (offset_us[chosen] / (2 * HALF_SWEEP_US) + 0.5)[:, None]
     points = in_world[chosen]
     in_box = apply_transform(early, points) * (1 - fraction)

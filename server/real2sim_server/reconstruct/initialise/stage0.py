@@ -1,4 +1,4 @@
-"""Stage 0: from a log to a scene of Gaussians without training."""
+"""Stage 0: builds a scene of Gaussians from a log without training."""
 
 from __future__ import annotations
 
@@ -58,15 +58,15 @@ from .views import PlacedSurfels, ProjectedView, SkySamples, chosen_frames, gath
 
 OPACITY = 0.95
 ABOVE_GROUND = 0.1
-"""Points this close to the ground surface are replaced by it [m]."""
+"""Points within this distance of the ground surface are replaced by it [m]."""
 LIDAR_REACH = 0.5
-"""Points from images are taken where LiDAR has none so close [m]."""
+"""Minimum distance of points from images to the nearest LiDAR point [m]."""
 FEATURE_HEIGHT = 0.3
 """Minimum height of these points above the ground [m]: LiDAR covers the road, and reflections are
 below it.
 """
 STEREO_VOXEL, STEREO_PER_METRE = 0.15, 0.01
-"""Points from images are joined in voxels of this edge, larger with the distance by so much."""
+"""Voxel edge for points from images [m], and its growth with the distance."""
 STEREO_WEIGHT = 3
 """Minimum number of points per voxel."""
 UNDERSIDE_COLOUR = 0.06
@@ -77,14 +77,14 @@ WALL_FRAMES = 16
 BACKGROUND_HEIGHTS = (0.3, 1.0, 3.0)
 OBJECT_HEIGHTS = (-0.35, 0.0, 0.3)
 BODY_COLOR_REACH = 0.2
-"""How far the colours of a vehicle's seen parts reach beyond them [m]."""
+"""Reach of the colours of a vehicle's seen parts into unseen ones [m]."""
 
 
 @dataclass(frozen=True, eq=False)
 class _SurfelSet:
-    """All Gaussians in the making.
+    """All Gaussians of the scene under construction.
 
-    In this order: ground, structure, continued walls, then object by object.
+    Order: ground, structure, continued walls, then object by object.
     """
 
     surfels: Surfels
@@ -112,7 +112,7 @@ class _SurfelSet:
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """Points from images alone: single features, and [N, 3] whatever planes were swept through."""
+    """Points from images alone: matched features, and [N, 3] points from plane sweeps."""
 
     features: TriangulatedPoints
     swept: NDArray[np.float32]
@@ -259,7 +259,7 @@ def _above_ground(background: PointSet, surface: Ground) -> PointSet:
 def _surfels_of_images(
     seen: _Seen, background: PointSet, surface: Ground, path: Float, options: InitialiseOptions
 ) -> Surfels:
-    """What only images show, where the background has no LiDAR point and above the ground."""
+    """Points from images, above the ground and away from the background's LiDAR points."""
     swept = seen.swept[_beyond_lidar(seen.swept, background, surface)]
     distance = path_distance(swept, path)
     held = well_supported(swept, 0.1 + 0.015 * distance)
@@ -278,7 +278,7 @@ def _surfels_of_images(
 def _beyond_lidar(
     points: NDArray[np.float32], background: PointSet, surface: Ground
 ) -> NDArray[np.bool_]:
-    """Which are above the ground and have no LiDAR point near them."""
+    """Mask of points above the ground without a LiDAR point nearby."""
     from scipy.spatial import cKDTree
 
     distance = np.full(len(points), np.inf)
@@ -292,7 +292,7 @@ def _beyond_lidar(
 def _object_points(
     points: PointSet, track: ObjectTrack, body: VehicleBody | None, options: InitialiseOptions
 ) -> PointSet:
-    """Thinned points of an object, its unobserved parts completed."""
+    """Thinned points of an object, with its unobserved parts completed."""
     thinned = thin_to(points, options.object_voxel, options.max_object // 2)
     if track.size[0] >= VEHICLE_LENGTH:
         thinned = mirrored(thinned, voxel=options.object_voxel)
@@ -400,7 +400,7 @@ def _inpaint_objects(
             closed.append(k)
             places = parts.surfels.points[mine].astype(np.float64)
             nearest = body.nearest(places)
-            # A side seen edge on has the colours of the background next to its outline.
+            # A side seen edge-on shows the colours of the background next to its outline.
             seen = known[mine] & faced(log, track, places, body.normals[nearest], frames)
             normals = body.unit_normals()[nearest] @ pose_amid(track.trajectory)[:3, :3].T
             surfaces.append(

@@ -1,4 +1,4 @@
-"""Gaussians from points: their shape, points spread over the ground, colours no camera observed."""
+"""Gaussians from points: shapes, ground points, and colours that no camera observed."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ...scene.ground_fit import GroundFit, pull_push
 
 NEIGHBOURS = 20
 CHUNK = 50_000
-"""Number of points fitted at a time; limits the memory."""
+"""Number of points fitted at a time. Limits the memory."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +46,7 @@ class Surfels:
         return matrix_to_quaternion(self.axes).astype(np.float32)
 
     def select(self, index: NDArray[np.bool_] | NDArray[np.int64]) -> Surfels:
-        """The surfels picked by a mask or by indices."""
+        """The surfels selected by a mask or by indices."""
         return Surfels(self.points[index], self.axes[index], self.scales[index])
 
     @classmethod
@@ -131,7 +131,7 @@ def _fit_chunk(
     axes[:, :, 2] *= np.sign(np.linalg.det(axes))[:, None]
     local = np.einsum("nki,nij->nkj", offsets, axes)
     tangent = np.stack([_gap(local, 0), _gap(local, 1)], axis=1)
-    # Three neighbouring Gaussians then cover the middle of a gap by more than 90 %.
+    # Three neighbouring Gaussians then reach an opacity above 90 % in the middle of a gap.
     tangent = np.clip(0.6 * tangent, 2 * smallest, bound[:, None])
     thickness = np.sqrt(np.maximum(variances[:, 0], 0) / np.maximum(variances[:, 2], 1e-12))
     normal = tangent.mean(axis=1) * np.clip(thickness, 0.12, 0.8)
@@ -178,7 +178,7 @@ def spread_ground(fit: GroundFit, spacing: float, limit: int) -> GroundPoints:
     """Cover the ground with a square grid that coarsens with the distance from the drive.
 
     Args:
-        fit: of the ground; points are on its surface as measured.
+        fit: fit of the ground; points are on its measured surface.
         spacing: distance between points near the drive [m].
         limit: maximum number of points; the grid coarsens to stay below it.
     """
@@ -231,7 +231,7 @@ def _surface_normals(surface: Ground, xy: Float) -> NDArray[np.float32]:
 # --- Inpainting -----------------------------------------------------------------------------------
 
 MIRROR_REACH = 0.15
-"""An unobserved point takes the colour of a point observed this near to its mirror image [m]."""
+"""Maximum distance of an observed point from the mirror image of the point it colours [m]."""
 TRUST_REACH = 1.0
 """Distance over which the weight of an observed neighbour's colour falls to 1/e [m]."""
 MIN_OBSERVED = 30
@@ -245,9 +245,9 @@ Known = NDArray[np.bool_]
 
 
 class ColourPrior:
-    """What colour a point is likely to have, by its height and its LiDAR intensity.
+    """Prior for the colour of a point, given its height and LiDAR intensity.
 
-    Learnt from the seen points of the same log: mean colours by height and intensity class.
+    Holds the mean colours of the log's seen points by height and intensity class.
     """
 
     def __init__(
@@ -270,7 +270,7 @@ class ColourPrior:
         for row in range(shape[0]):
             for column in range(shape[1]):
                 members = colours[known][(rows == row) & (columns == column)]
-                # A few members more of the overall mean keep small classes from being odd.
+                # A few extra samples of the overall mean regularise small classes.
                 total = members.sum(axis=0, dtype=np.float64) + 20 * mean
                 self._table[row, column] = total / (len(members) + 20)
 
@@ -293,7 +293,7 @@ def fill_from_neighbours(
     *,
     trust_reach: float = TRUST_REACH,
 ) -> Colours:
-    """Colour unobserved points from seen ones nearby, and from ``prior`` [N, 3] where none is near.
+    """Colour unobserved points from observed points nearby, otherwise from ``prior`` [N, 3].
 
     The weight of neighbours' colours falls to 1/e over ``trust_reach`` [m].
     """
@@ -322,8 +322,8 @@ def body_color(
 ) -> Colours:
     """The most common colour of an object's seen points at about the same height.
 
-    The mode is used instead of the mean: lamps, plates and reflections do not represent the rest of
-    a body, its paint does.
+    The mode represents the paint better than the mean, because it ignores lamps, plates and
+    reflections.
 
     Args:
         heights: [N] as a fraction of the object's height, 0 at its middle.
@@ -375,7 +375,7 @@ def fill_from_mirror(
 def fill_ground(
     surface: Ground, points: NDArray[np.float32], colours: Colours, known: Known
 ) -> Colours:
-    """Colour unobserved ground points from the observed ground around, ever smoother inwards."""
+    """Colour unobserved ground points from the ground around them, smoother towards the middle."""
     if known.all() or not known.any():
         return np.where(known[:, None], colours, GREY)
     shape = surface.heights.shape

@@ -17,22 +17,22 @@ from ..logged_view import resized, still_surfaces
 # Triangulation of features matched between known poses.
 
 MAX_WIDTH = 1280
-"""Images are made smaller to this width [px]."""
+"""Images are downscaled to this width [px]."""
 FEATURES = 4000
-"""Features of an image at most, the strongest."""
+"""Maximum number of features per image. The strongest are kept."""
 BASELINES = (0.5, 1.5, 4.0)
 """Each image is matched with the next one, and with the first one beyond each baseline [m]."""
 MIN_STEP = 0.2
-"""Images of a camera closer to each other than this tell nothing new [m]."""
+"""Minimum distance between consecutive images of a camera [m]."""
 MIN_DEPTH, MAX_DEPTH = 1.0, 400.0
 EPIPOLAR_ERROR = 1.5
-"""Largest distance of a match from its epipolar line, and of an image from its point [px]."""
+"""Maximum distance of a match from its epipolar line, and maximum reprojection error [px]."""
 RATIO = 0.8
-"""A match is this much closer than the next along its epipolar line (Lowe 2004)."""
+"""Ratio test: maximum distance of a match relative to the next best one (Lowe 2004)."""
 SIGHTINGS = 3
-"""Images that a point must be seen in."""
+"""Minimum number of images that show a point."""
 RELATIVE_ERROR = 0.2
-"""Largest standard deviation of a point, as part of its distance."""
+"""Maximum standard deviation of a point, as a fraction of its distance."""
 
 _Progress = Callable[[int, int], None]
 
@@ -43,8 +43,8 @@ class TriangulatedPoints:
 
     Attributes:
         points: [N, 3] float32, world frame [m].
-        deviation: [N] float32, largest standard deviation if images are right to half a pixel [m].
-        sightings: [N] int32, images that saw each.
+        deviation: [N] float32, largest standard deviation for image errors of half a pixel [m].
+        sightings: [N] int32, number of images that show each point.
     """
 
     points: NDArray[np.float32]
@@ -55,7 +55,7 @@ class TriangulatedPoints:
         return len(self.points)
 
     def select(self, index: NDArray[np.bool_]) -> TriangulatedPoints:
-        """Those of a mask."""
+        """The points selected by a mask."""
         return TriangulatedPoints(self.points[index], self.deviation[index], self.sightings[index])
 
 
@@ -79,14 +79,14 @@ class _Features:
 def triangulate(log: DrivingLog, *, max_images: int, on_image: _Progress) -> TriangulatedPoints:
     """Points of the static scene, from features shared by at least three images.
 
-    SIFT features (Lowe 2004) outside all boxes and the sky are matched along epipolar lines,
-    because poses are known, between images of one camera taken decimetres to metres apart. Matches
-    are joined to tracks. A track becomes a point if its reprojection error is within a pixel and a
-    half in all images and its uncertainty is below a tenth of its distance. The same log gives the
-    same bits.
+    SIFT features (Lowe 2004) outside all boxes and the sky are matched along the epipolar lines of
+    the known poses, between images of one camera taken decimetres to metres apart. Matches are
+    joined to tracks. A track becomes a point if its reprojection error is at most 1.5 px in all
+    images and its standard deviation is at most 20 % of its distance. The result is deterministic,
+    bit for bit.
 
     Args:
-        log: with calibrated cameras and poses.
+        log: log with calibrated cameras and poses.
         max_images: maximum number per camera, evenly spread.
         on_image: called with the number of finished images and of all images.
     """
@@ -109,7 +109,7 @@ def triangulate(log: DrivingLog, *, max_images: int, on_image: _Progress) -> Tri
 
 
 def spread_frames(log: DrivingLog, camera: Camera, limit: int) -> list[int]:
-    """Frames with camera motion in between, at most ``limit``."""
+    """Up to ``limit`` frames with camera motion between them."""
     kept: list[int] = []
     last: Float | None = None
     if limit == 0:
@@ -167,7 +167,7 @@ def _tracks(images: list[_Features]) -> list[NDArray[np.int64]]:
 
 
 def _pairs(images: list[_Features]) -> Iterator[tuple[int, int]]:
-    """Which images are matched: each with the next, and with the first beyond each baseline."""
+    """Pairs of images to match: each with the next, and with the first beyond each baseline."""
     centres = np.array([i.centre for i in images]).reshape(-1, 3)
     for a in range(len(images) - 1):
         distance = np.linalg.norm(centres[a + 1 :] - centres[a], axis=1)
@@ -176,7 +176,7 @@ def _pairs(images: list[_Features]) -> Iterator[tuple[int, int]]:
 
 
 def _matches(first: _Features, second: _Features) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows of features that are each other's best along the epipolar lines, clearly so."""
+    """Rows of features that are mutual best epipolar matches and pass the ratio test."""
     none = np.zeros(0, np.int64)
     if min(len(first.pixels), len(second.pixels)) < 2:
         return none, none
@@ -215,7 +215,7 @@ def _fundamental(first: _Features, second: _Features) -> Float:
 def _points(
     sightings: list[tuple[Float, Float, Float]], labels: list[NDArray[np.int64]]
 ) -> TriangulatedPoints:
-    """A point for each track that holds."""
+    """One point for each consistent track."""
     seen = [np.flatnonzero(label >= 0) for label in labels]
     if sum(map(len, seen)) == 0:
         none = np.zeros(0, np.float32)
@@ -227,7 +227,7 @@ def _points(
     centres = np.array([c for _, c, _ in sightings])
     _, track = np.unique(track, return_inverse=True)
     counts = np.bincount(track)
-    # Two features of one image in a track: one of its matches was wrong.
+    # A track with two features of one image contains a wrong match.
     places = track * len(seen) + image
     single = np.bincount(track[np.unique(places, return_index=True)[1]], minlength=len(counts))
     points, precision, in_front, worst = _intersect(track, image, pixels, projections)
@@ -289,9 +289,9 @@ def _intersect(
 # images agree best is accepted if the depths of the neighbours are consistent with it.
 
 WIDTH = 320
-"""Images are compared at this width [px]; it gives depths to a few percent."""
+"""Width at which images are compared [px]. Depths are accurate to a few percent."""
 STEREO_BASELINES = (0.8, 1.6)
-"""Each image is compared with those taken about so far before and after it [m]."""
+"""Distances to the earlier and later images that each image is compared with [m]."""
 PLANES = 96
 NEAREST, FARTHEST = 4.0, 90.0
 """Depths of the planes, evenly spread by their inverse [m]."""
@@ -300,11 +300,11 @@ WINDOW = 5
 MIN_CONTRAST = 2.0
 """Minimum standard deviation of brightness in a window, 0 to 255; flatter windows are ambiguous."""
 MIN_LIKENESS = 0.6
-"""Normalised cross-correlation of squares, mean of the two best neighbours."""
+"""Minimum normalised cross-correlation of windows, mean of the two best neighbours."""
 CLEARNESS, APART = 0.05, 3
 """Minimum lead in correlation of the best plane over all planes at least this many planes away."""
 AGREEMENT = 0.03
-"""Depths of two images agree to this share."""
+"""Maximum relative difference between consistent depths of two images."""
 AGREEING = 2
 """Minimum number of other images with a consistent depth."""
 MARGIN = 0.03
@@ -320,7 +320,7 @@ class _View:
         free: [H, W] bool, outside of the sky and of the boxes of objects.
         K: [3, 3] at this size.
         pose: [4, 4] ``T_world_camera``.
-        rows: those from the top that are compared.
+        rows: number of compared rows, from the top.
     """
 
     grey: NDArray[np.float32]
@@ -334,7 +334,7 @@ def sweep_planes(log: DrivingLog, *, max_images: int, on_image: _Progress) -> ND
     """Points [N, 3] float32 of the static scene above the LiDAR's field of view, world frame [m].
 
     Args:
-        log: with calibrated cameras and poses; cameras other than pinholes are skipped.
+        log: log with calibrated cameras and poses; only pinhole cameras are used.
         max_images: maximum number per camera, evenly spread.
         on_image: called with the number of finished images and of all images.
     """
@@ -365,7 +365,7 @@ def _read(log: DrivingLog, camera: Camera, frame: int) -> _View:
 
 
 def _rows(log: DrivingLog, camera: Camera, frame: int) -> int:
-    """Rows from the top down to the highest returns of LiDAR."""
+    """Number of rows from the top to the highest LiDAR returns."""
     to_camera = invert_transform(camera.T_vehicle_camera)
     x, y, z = apply_transform(to_camera, log.lidar(frame).points.astype(np.float64)).T
     ahead = z > 1
@@ -376,7 +376,7 @@ def _rows(log: DrivingLog, camera: Camera, frame: int) -> int:
 
 
 def _neighbours(view: _View, views: list[_View]) -> list[_View]:
-    """Those nearest to each of STEREO_BASELINES, before and after."""
+    """The images nearest to each of STEREO_BASELINES, before and after."""
     offsets = np.array([v.pose[:3, 3] - view.pose[:3, 3] for v in views])
     distance = np.linalg.norm(offsets, axis=1)
     mine = next(k for k, v in enumerate(views) if v is view)
@@ -391,7 +391,7 @@ def _neighbours(view: _View, views: list[_View]) -> list[_View]:
 
 
 def _depths(view: _View, neighbours: list[_View]) -> NDArray[np.float32]:
-    """Depths [rows, W] of an image [m], 0 where they are not clear."""
+    """Depths [rows, W] of an image [m], 0 where they are ambiguous."""
     rows, width = view.rows, view.grey.shape[1]
     none = np.zeros((rows, width), np.float32)
     if len(neighbours) < 2:

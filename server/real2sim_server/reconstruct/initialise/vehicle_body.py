@@ -31,24 +31,24 @@ from .vehicle_parts import (
 
 # Bodies.
 #
-# The body tells where the unmeasured sides are, and separates paint from glass, tyres and lamps.
-# The paint's colour comes from the vehicle itself.
+# The body gives the shape of the unmeasured sides, and separates paint from glass, tyres and
+# lamps. The colour of the paint comes from the log.
 
 SPACING = 0.05
 """Distance between points on a body [m]."""
 WIDE_SPACING = 0.12
-"""Spacing of rendered points where a body is flat and of a single part [m]."""
+"""Spacing of rendered points on flat regions of a single part [m]."""
 FLAT = 0.95
 """Minimum cosine between normals of neighbours on a flat body."""
 FEW_POINTS = 50
-"""Fewer measured points do not tell one shape from another."""
+"""Minimum number of measured points to distinguish shapes."""
 COMPARED = 1500
 MAX_SCALE = 1.35
-"""A body that would have to be stretched or pressed more than this is another kind of vehicle."""
+"""Maximum factor by which a body may be stretched or compressed to fit a box."""
 GRAZING = 0.35
-"""A camera barely sees a surface below this cosine between ray and normal (20 degrees)."""
+"""Minimum cosine between ray and normal of a visible surface (20 degrees of grazing)."""
 PAINT_REACH = 0.2
-"""Points farther from a body give no evidence of its parts [m]."""
+"""Maximum distance from a body of points that are evidence for its parts [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,9 +59,9 @@ class VehicleBody:
         points: [N, 3] float64 [m].
         normals: [N, 3] float64, outwards.
         parts: [N] uint8, see :class:`.vehicle_parts.Part`.
-        own_colours: [N, 3] float32, the builder's, of points with part ``OTHER``.
-        drawn: [N] float32, distance to the next rendered point if redundant points are omitted
-            [m]; 0 for omitted points.
+        own_colours: [N, 3] float32, colours from the vehicle builder, for points of part ``OTHER``.
+        drawn: [N] float32, spacing of the rendered points after removal of redundant ones [m]; 0
+        for omitted points.
     """
 
     points: Float
@@ -76,7 +76,7 @@ class VehicleBody:
         return np.asarray(self.parts == Part.PAINT)
 
     def colours(self, palette: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Colours [N, 3] from ``palette`` [10, 3]; ``OTHER`` has its own colours."""
+        """Colours [N, 3] from ``palette`` [10, 3]; ``own_colours`` for part ``OTHER``."""
         other = (self.parts == Part.OTHER)[:, None]
         return np.where(other, self.own_colours, palette[self.parts])
 
@@ -122,12 +122,12 @@ class VehicleBody:
 def fitted_body(
     measured: NDArray[np.float32], size: tuple[float, float, float], category: str
 ) -> VehicleBody | None:
-    """The body of a category that is nearest to measured points; None for other categories.
+    """The body of a category that fits measured points best; None for other categories.
 
     Args:
         measured: [N, 3] in the object frame [m].
-        size: of the box [m].
-        category: of the track.
+        size: size of the box [m].
+        category: category of the track.
     """
     shapes = [s for s in SHAPES if s.category == category and _fits(s, size)]
     if not shapes:
@@ -161,12 +161,12 @@ def body_colours(
     light: Float,
     palette: NDArray[np.float32],
 ) -> NDArray[np.float32]:
-    """Colours [B, 3] of the points of a body: its paints and parts, under the given light.
+    """Colours [B, 3] of the points of a body under the given light.
 
     Args:
         points: [N, 3] of a vehicle in that box, from stage 0.
-        colours: [N, 3] of these. The most common paint colour without the light becomes the paint;
-            a truck's cargo is handled the same.
+        colours: [N, 3] of these points. The most common colour of painted points, with the light
+        removed, becomes the paint. A truck's cargo is handled likewise.
         light: slopes [3] in the frame of the box, see :func:`.vehicle_parts.fit_light`.
         palette: colours [10, 3] of parts, see :func:`.vehicle_parts.fit_palette`.
     """
@@ -188,7 +188,7 @@ def faced(
     Args:
         points: [N, 3] in the frame of the track's box [m].
         normals: [N, 3] of the surface there.
-        frames: of the log that count.
+        frames: indices into the log.
     """
     found = np.zeros(len(points), dtype=np.bool_)
     for frame, camera in itertools.product(frames, log.rig):
@@ -225,11 +225,11 @@ def _scaled(
 
 @cache
 def _body(shape: VehicleShape) -> VehicleBody:
-    """Points of a shape in its own size."""
+    """Points of a shape at its original size."""
     paints: list[tuple[float, ...]] = []
     mesh = build_vehicle(shape, paints)
     triangle, weights = _spread(mesh.corners)
-    # Wheels first: the surrounding shell is in the same cells, just behind their outer faces.
+    # Wheels come first: the shell behind their outer faces falls into the same cells.
     order = np.argsort(mesh.material[triangle] != WHEEL, kind="stable")
     triangle, weights = triangle[order], weights[order]
     points = np.einsum("nk,nkd->nd", weights, mesh.corners[triangle])
@@ -261,7 +261,7 @@ def _drawn_spacing(points: Float, normals: Float, parts: NDArray[np.uint8]) -> N
     unit = normals / np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-9)
     cosine = (unit[near[:, 0]] * unit[near[:, 1]]).sum(1)
     unlike = (cosine < FLAT) | (parts[near[:, 0]] != parts[near[:, 1]])
-    # The other side of something thin is not an edge.
+    # The opposite side of a thin part does not make an edge.
     unlike &= cosine > -0.5
     plain = np.ones(len(points), dtype=np.bool_)
     plain[near[unlike].ravel()] = False
@@ -277,7 +277,7 @@ def _drawn_spacing(points: Float, normals: Float, parts: NDArray[np.uint8]) -> N
 
 
 def _on_cargo(shape: VehicleShape, points: Float) -> NDArray[np.bool_]:
-    """Which points [N] of a body are on the sides of the box behind its cab."""
+    """Mask [N] of the points on the sides of the cargo box."""
     length, width, height = shape.size
     rear, front = (x * length for x in shape.cargo)
     if rear == front:
@@ -289,7 +289,7 @@ def _on_cargo(shape: VehicleShape, points: Float) -> NDArray[np.bool_]:
 
 
 def _outwards(shape: VehicleShape, points: Float, material: NDArray[np.int32]) -> Float:
-    """Outward directions [N, 3] of the convex piece of each point; windings differ by piece."""
+    """Outward directions [N, 3] of the convex piece of each point. Windings differ by piece."""
     length, width, height = shape.size
     centres = np.zeros_like(points)
     # The shell is nearly convex: all of it is visible from the line through its middle.
@@ -325,7 +325,7 @@ def _spread(corners: Float) -> tuple[NDArray[np.int64], Float]:
 # Shape of objects with too few LiDAR points.
 
 GAP = 0.25
-"""The generic body fills where no measured point is this near [m]."""
+"""The generic body fills places without a measured point within this distance [m]."""
 WINDOW_LINE, LEAN = 0.58, 0.2
 PROFILES = {
     "car": ((-0.5, 0.68), (-0.44, 0.75), (-0.3, 0.97), (0.0, 1.0), (0.1, 0.95), (0.25, 0.66),
@@ -335,7 +335,7 @@ PROFILES = {
 """Side views: (position along the length from -0.5 to 0.5, height from 0 to 1), front last."""
 
 VEHICLE_LENGTH = 2.5
-"""Objects at least this long are taken for vehicles, with a dark underside [m]."""
+"""Minimum length of objects treated as vehicles, with a dark underside [m]."""
 UNDERSIDE_HEIGHT = 0.05
 """Height of the underside over the box bottom, so that the road does not show through [m]."""
 
@@ -343,8 +343,8 @@ UNDERSIDE_HEIGHT = 0.05
 def underside(size: tuple[float, float, float], *, spacing: float = 0.08) -> Surfels:
     """A flat plate under a vehicle, in the object frame; empty for other objects.
 
-    Cameras see the dark underside and contact shadow of a car. They belong to the car and move with
-    it; the road keeps its own colour.
+    The plate holds the dark underside and contact shadow that cameras see, so that they move with
+    the car and leave the road's colour unchanged.
 
     Args:
         size: (length, width, height) [m].
@@ -377,7 +377,7 @@ def complete_body(
         measured: points in the object frame.
         size: (length, width, height) [m].
         category: class of the object.
-        body: of a vehicle, used instead of the generic one.
+        body: body of a vehicle, used instead of the generic one.
         spacing: distance between points of the body [m]; larger for large objects.
     """
     from scipy.spatial import cKDTree
@@ -417,7 +417,7 @@ def _box_surface(size: Float, spacing: float) -> Float:
 
 
 def _with_profile(points: Float, size: Float, category: str) -> Float:
-    """Press points [N, 3] of a box surface down to the side view of a vehicle."""
+    """Lower points [N, 3] of a box surface to the side view of a vehicle."""
     profile = PROFILES.get(category)
     points = points.copy()
     if profile is None:
@@ -447,11 +447,10 @@ def _face(half: Float, axis: int, sign: int, spacing: float) -> Float:
 
 # Colours of unseen sides: mirrored, by part, or in one paint.
 #
-# Shading is removed first and applied again for the side's direction.
+# Shading is removed first and applied again for the direction of the unseen side.
 
 ON_PART = 0.06
-"""Points within this distance of a body have the colour of its part [m]; others are behind its
-glass.
+"""Maximum distance of points with the colour of the body's part [m]. Others are behind glass.
 """
 
 
@@ -464,7 +463,7 @@ class VehicleSurface:
         normals: [N, 3] float64 unit, outwards, in the world.
         colours: [N, 3] float32 where ``seen``.
         seen: [N] bool.
-        body: that fits it.
+        body: the fitted body.
     """
 
     points: NDArray[np.float32]
@@ -474,7 +473,7 @@ class VehicleSurface:
     body: VehicleBody
 
     def seen_paint(self) -> NDArray[np.bool_]:
-        """[N] bool: seen, and no lamp, glass or tyre."""
+        """[N] bool: seen, and not lamp, glass or tyre."""
         return np.asarray(self.seen & (self.parts() == Part.PAINT))
 
     def parts(self, *, reach: float = PAINT_REACH) -> NDArray[np.uint8]:
@@ -490,10 +489,10 @@ class VehicleSurface:
 def fill_vehicles(
     surfaces: Sequence[VehicleSurface],
 ) -> tuple[list[NDArray[np.float32]], Float, NDArray[np.float32]]:
-    """Colours [N, 3] of all points of each vehicle, the light [3] and the palette [10, 3] of all.
+    """Colours [N, 3] of each vehicle's points, and the shared light [3] and palette [10, 3].
 
-    Seen colours do not change. A vehicle with almost no seen paint gets a grey with the median
-    brightness of the others: the median of their colours is a colour that no vehicle has.
+    Seen colours do not change. A vehicle with almost no seen paint becomes grey, with the median
+    brightness of the others.
     """
     painted = [s.seen_paint() for s in surfaces]
     light = fit_light(

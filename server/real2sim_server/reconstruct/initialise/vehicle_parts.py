@@ -13,20 +13,20 @@ from ...scene import SceneObject, Trajectory
 from ...synthetic.vehicles import VehicleShape, roof_heights
 from .surfels import MIN_OBSERVED, modal_colour
 
-# Shading: one paint is brighter where it faces the sun and the sky.
+# Shading: paint is brighter where it faces the sun and the sky.
 #
 # Images show most vehicles from one side. The colour of the other sides follows from the paint and
-# from the mean brightness, over all vehicles of a log, of sides that face one direction relative
-# to another.
+# from the relative brightness of sides by direction, averaged over all vehicles of a log.
 
 FROM_ABOVE = (0.0, 0.0, 0.25)
-"""Slopes without evidence from vehicles."""
+"""Prior slopes, used without evidence from vehicles."""
 DOUBT = 2.0
-"""Weight of these, in vehicles."""
+"""Weight of the prior slopes, in vehicles."""
 FEW = 100
 """Minimum number of seen points of a vehicle."""
 ODD = 0.15
-"""Logarithms of brightness that differ more are of reflections, cast shadows, or no paint."""
+"""Points with a larger deviation of the log brightness get less weight (Huber): they show
+reflections, cast shadows or no paint."""
 ROUNDS = 10
 DARKEST = 0.02
 LIGHT = "vehicle_light"
@@ -34,10 +34,10 @@ LIGHT = "vehicle_light"
 
 
 def fit_light(normals: Sequence[Float], colours: Sequence[NDArray[np.float32]]) -> Float:
-    """Slopes [3] of the logarithm of brightness over a surface's normal, the same on all vehicles.
+    """Slopes [3] of the log brightness with respect to the surface normal, shared by all vehicles.
 
     Args:
-        normals: by vehicle, [N, 3] unit, in a frame that all share.
+        normals: by vehicle, [N, 3] unit, in a common frame.
         colours: by vehicle, [N, 3] of paint there.
     """
     members = [k for k, seen in enumerate(normals) if len(seen) >= FEW]
@@ -49,7 +49,7 @@ def fit_light(normals: Sequence[Float], colours: Sequence[NDArray[np.float32]]) 
     bright = np.concatenate([colours[k].mean(axis=1) for k in members])
     rest = np.log(bright.clip(DARKEST)) - unit @ prior
     share = np.concatenate([np.full(len(normals[k]), 1 / len(normals[k])) for k in members])
-    # Each vehicle has its own unknown paint.
+    # The paint of each vehicle is unknown.
     columns = np.concatenate([unit, np.eye(len(members))[owner]], axis=1)
     doubt = np.diag([DOUBT / 30] * 3 + [1e-6] * len(members))
     weight, found = share, np.zeros(columns.shape[1])
@@ -61,15 +61,15 @@ def fit_light(normals: Sequence[Float], colours: Sequence[NDArray[np.float32]]) 
 
 
 def brightness(light: Float, normals: Float) -> NDArray[np.float32]:
-    """How bright [N, 1] paint is on surfaces of unit ``normals`` [N, 3], 1 on average."""
+    """Brightness [N, 1] of paint on surfaces with unit ``normals`` [N, 3], 1 on average."""
     return np.exp(normals @ light)[:, None].astype(np.float32)
 
 
 def light_on(item: SceneObject, reconstruction: object) -> Float:
-    """The slopes [3] in the frame of an object, at its pose in the middle of its time.
+    """The slopes [3] in the frame of an object, at its pose in the middle of its time span.
 
     Args:
-        reconstruction: of the scene's provenance; without slopes, light comes from above.
+        reconstruction: entry of the scene's provenance; without slopes, light is from above.
     """
     known = reconstruction.get(LIGHT) if isinstance(reconstruction, dict) else None
     light = np.array(FROM_ABOVE if known is None else known, dtype=np.float64)
@@ -77,7 +77,7 @@ def light_on(item: SceneObject, reconstruction: object) -> Float:
 
 
 def pose_amid(trajectory: Trajectory) -> Float:
-    """``T_world_object`` [4, 4] in the middle of its time, the reference pose for the light."""
+    """``T_world_object`` [4, 4] in the middle of the time span, the reference for the light."""
     return trajectory.transform((trajectory.start_us + trajectory.end_us) // 2)
 
 
@@ -87,7 +87,7 @@ def pose_amid(trajectory: Trajectory) -> Float:
 # than under clouds.
 
 PALETTE_DOUBT = 2.0
-"""Weight of the usual colour of a part, in vehicles that show theirs."""
+"""Weight of the default colour of a part, in vehicles that show the part."""
 PARTS = "vehicle_parts"
 """Key of the colours of parts in a scene's reconstruction provenance."""
 FRAME = 0.035
@@ -100,8 +100,8 @@ Colours = NDArray[np.float32]
 class Part(IntEnum):
     """Part of a vehicle body.
 
-    Paint and cargo (the box of a truck) differ between vehicles; ``OTHER`` has the builder's
-    colour.
+    The colours of paint and cargo (the box of a truck) differ between vehicles. ``OTHER`` has the
+    colour that the vehicle builder assigned.
     """
 
     PAINT = 0
@@ -125,13 +125,13 @@ DEFAULT_COLOURS: dict[Part, tuple[float, float, float]] = {
     Part.RED_LAMP: (0.45, 0.1, 0.1),
     Part.PLATE: (0.6, 0.6, 0.58),
 }
-"""sRGB of parts in the light of a surface that faces the horizon, before a log is looked at."""
+"""Default sRGB of parts in the light of a surface that faces the horizon."""
 FITTED = (Part.GLASS, Part.TRIM, Part.TYRE)
 """Parts that are similar on all vehicles and large enough to be seen. Lamps can be on or off, and
 rims appear together with the dark gaps between their spokes.
 """
 PAINTED = (Part.PAINT, Part.CARGO)
-"""Parts in a vehicle's own paints."""
+"""Parts with a paint per vehicle."""
 
 
 def default_palette() -> Colours:
@@ -177,7 +177,9 @@ def shown_paints(
 def with_paints(
     palette: Colours, paints: dict[Part, NDArray[np.float32]], usual: NDArray[np.float32]
 ) -> Colours:
-    """The palette [10, 3] of one vehicle: a paint that it does not show is the other, or usual."""
+    """The palette [10, 3] of one vehicle.
+
+    A paint that the vehicle does not show defaults to the other one, otherwise to ``usual`` [3]."""
     known = [paints[part] for part in PAINTED if part in paints]
     own = palette.copy()
     for part in PAINTED:
@@ -195,7 +197,7 @@ def palette_of(reconstruction: object) -> Colours:
 
 
 def wheel_parts(uv: Float) -> NDArray[np.uint8]:
-    """Tyre, rim, or the dark between a rim's spokes, at places [N, 2] relative to the radius."""
+    """Tyre, rim, or the gap between spokes, at positions [N, 2] relative to the radius."""
     radius, angle = np.hypot(uv[:, 0], uv[:, 1]), np.arctan2(uv[:, 1], uv[:, 0])
     between = (radius > 0.22) & (radius < 0.6) & (np.cos(5 * angle) < -0.1)
     return np.where((radius < 0.68) & ~between, Part.RIM, Part.TYRE).astype(np.uint8)

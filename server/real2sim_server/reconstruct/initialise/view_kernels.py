@@ -1,8 +1,7 @@
 """Compiled loops over Gaussians in one camera image: projection, depth, visibility, samples.
 
 Loops run over a range of Gaussians and write only to that range, so ranges can be distributed over
-threads and the result does not depend on the number of threads. The kernels release the GIL;
-Numba's ``parallel`` would take several times longer to compile.
+threads and the result does not depend on the number of threads. The kernels release the GIL.
 """
 # ruff: noqa: PLR0917 - compiled loops take their arrays one by one
 
@@ -18,8 +17,8 @@ NEAR = np.float32(0.3)
 MAX_FOOTPRINT = 24
 """Half-width of the largest footprint in the depth image [px]."""
 GRAZING = 0.15
-"""Minimum cosine between ray and surface for colours of objects. At smaller angles, a few
-centimetres of error give the colour of the adjacent side, for example a lamp on a wing.
+"""Minimum cosine between ray and surface normal for colours of objects. At grazing angles, an error
+of a few centimetres samples the adjacent side, for example a lamp instead of a wing.
 """
 
 
@@ -84,7 +83,7 @@ def splat_depth(in_camera, turned, radii, K, depth):
 
 @func(nogil=True)
 def visible_weight(x, y, z, nx, ny, nz, px, py, K, depth):
-    """0 where the disk through (x, y, z) is hidden, 0.15 at its own silhouette, else 1."""
+    """0 if the disk through (x, y, z) is hidden, 0.15 at its silhouette, else 1."""
     fx, fy, cx, cy = K[0], K[1], K[2], K[3]
     height, width = depth.shape
     plane = nx * x + ny * y + nz * z
@@ -137,8 +136,8 @@ def gather_samples(
         K: [4] float32 of the image; the depth image is ``shrink`` times smaller.
         depth: from :func:`splat_depth`.
         first, second: [H, W] float32, depths of the nearest two objects, each rendered slightly
-            enlarged [m]; inf where there is none.
-        first_object: [H, W] int32, instance of the first; -1 where there is none.
+            enlarged [m]; inf for none.
+        first_object: [H, W] int32, instance of the first; -1 for none.
         levels: tuple of [H, W, 3] uint8 images, each half the size of the previous one.
         colours: [N, S, 3] uint8 and weights: [N, S] float32, updated.
     """
@@ -202,7 +201,7 @@ def robust_mean(colours, weights, result, known):
 
     Args:
         colours: [N, S, 3] uint8; weights: [N, S] float32, 0 for empty slots.
-        result: [N, 3] float32 in [0, 1], written where there is a sample.
+        result: [N, 3] float32 in [0, 1], written for Gaussians with a sample.
         known: [N] bool, written.
     """
     slots = weights.shape[1]
@@ -220,7 +219,7 @@ def robust_mean(colours, weights, result, known):
                 if abs(np.float32(colours[i, s, c]) - median) <= 24:
                     value += weights[i, s] * np.float32(colours[i, s, c])
                     fraction += weights[i, s]
-            # fraction is never 0: the median itself is among the samples.
+            # fraction is never 0, because the median is one of the samples.
             result[i, c] = value / (fraction * np.float32(255.0))
 
 

@@ -26,9 +26,9 @@ DEPTH_DOWNSCALE = 2
 """The depth image is this much smaller than the camera image."""
 PYRAMID = 4
 OBJECT_MARGIN = 0.12
-"""Objects occlude the scene behind them with this margin [m]."""
+"""Margin by which objects are enlarged to occlude the scene behind them [m]."""
 MAX_REACH = 15
-"""Bound of that margin [px of the depth image]."""
+"""Upper bound of this margin [px of the depth image]."""
 
 _NearestObjects = tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.float32]]
 
@@ -38,7 +38,7 @@ class PlacedSurfels:
     """All Gaussians of a scene under construction.
 
     Attributes:
-        surfels: in the frame of their instance.
+        surfels: surfels in the frames of their instances.
         instance: [N] uint16, 0 for the background, else 1 + index of the track; increasing.
     """
 
@@ -55,7 +55,7 @@ class ProjectedView:
         frame: index of the frame.
         T_camera_world: [4, 4].
         image: [H, W, 3] uint8.
-        depth: [H / 2, W / 2] float32 [m], nearest Gaussian, inf where there is none.
+        depth: [H / 2, W / 2] float32 [m], nearest Gaussian, inf for none.
         on_object: [H / 2, W / 2] bool, pixels on a tracked object or next to one.
     """
 
@@ -68,7 +68,7 @@ class ProjectedView:
 
 
 def chosen_frames(log: DrivingLog, limit: int) -> list[int]:
-    """At most ``limit`` frames, evenly spread, the first and the last among them."""
+    """At most ``limit`` frames, evenly spread, including the first and the last."""
     count = min(limit, log.frame_count)
     return sorted({round(i) for i in np.linspace(0, log.frame_count - 1, count)})
 
@@ -188,12 +188,12 @@ class ColourSamples:
         self._on_all_cores(work)
 
     def _on_all_cores(self, work: Callable[[slice], None]) -> None:
-        """Run ``work`` on ranges of Gaussians that together are all of them."""
+        """Run ``work`` on all Gaussians, split into ranges."""
         with ThreadPoolExecutor(self._cores) as pool:
             list(pool.map(work, _ranges(0, len(self._means), self._cores)))
 
     def _split_by_instance(self) -> list[tuple[int, slice]]:
-        """Ranges of Gaussians of one instance each; the background in one range per core."""
+        """Ranges of Gaussians, one per object, and one per core for the background."""
         bounds = np.flatnonzero(np.diff(self._placed.instance)) + 1
         edges = [0, *bounds.tolist(), len(self._means)]
         parts: list[tuple[int, slice]] = []
@@ -233,7 +233,7 @@ def gather_views(
 
 
 def _images(log: DrivingLog, frames: list[int]) -> Iterator[tuple[Camera, int, NDArray[np.uint8]]]:
-    """All images in order, read one ahead."""
+    """All images in order, prefetched by one."""
     wanted = [(camera, frame) for frame in frames for camera in log.rig]
     with ThreadPoolExecutor(1) as reader:
         ahead = [reader.submit(log.image, c.name, f) for c, f in wanted[:1]]
@@ -244,7 +244,7 @@ def _images(log: DrivingLog, frames: list[int]) -> Iterator[tuple[Camera, int, N
 
 
 def _instance_poses(log: DrivingLog, t_us: int) -> list[Float | None]:
-    """``T_world_instance``, first the background, then the tracks; None for absent tracks."""
+    """``T_world_instance`` of the background, then of the tracks; None for absent tracks."""
     return [np.eye(4), *(track.transform_near(t_us) for track in log.tracks)]
 
 
@@ -297,11 +297,11 @@ ZENITH = np.array([0.75, 0.82, 0.9])
 FADE = 1 / 24
 """Fraction of a full turn over which the weight of an observed colour falls to 1/e."""
 GROUND_ELEVATION = -0.03
-"""Directions below this elevation [rad] get the colour of the ground."""
+"""Elevation below which directions get the colour of the ground [rad]."""
 
 
 class SkySamples:
-    """Collects, for each direction, pixels of the sky, or else those that no Gaussian covers."""
+    """Collects sky pixels by direction, or pixels without a Gaussian if no sky was seen there."""
 
     def __init__(self, resolution: int) -> None:
         self._resolution = resolution
@@ -350,7 +350,7 @@ class SkySamples:
         return ahead[inside], u[inside], v[inside]
 
     def finish(self, ground_colour: NDArray[np.float32]) -> Sky:
-        """The cube map: medians where anything was seen, smoothly filled elsewhere."""
+        """The cube map: medians of the observed directions, smoothly filled elsewhere."""
         known = self._counts > 0
         texels = np.zeros((len(self._directions), 3), dtype=np.float32)
         texels[known] = self._median(known)
@@ -387,7 +387,7 @@ def _remap(image: NDArray[Any], columns: Coordinates, rows: Coordinates) -> NDAr
     """Bilinear values [N, 3] of an image [H, W, 3] at ``columns`` and ``rows`` [N]."""
     import cv2
 
-    # OpenCV bounds the width of a map, so that a long list of places takes several rows.
+    # OpenCV limits the width of a map, so long lists of positions take several rows.
     side = 1 << 14
     shape = -(-len(columns) // side), side
     maps = [np.zeros(shape, dtype=np.float32) for _ in range(2)]
@@ -424,7 +424,7 @@ def _panorama(
 
 
 def _around(row: NDArray[np.float64], known: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """A closed ring of colours [W, 3]: from the nearest known ones, fading to their mean."""
+    """A closed ring of colours [W, 3], fading from the nearest known ones to their mean."""
     width = len(row)
     place = np.flatnonzero(known)
     gap = np.abs(np.arange(width)[:, None] - place)
@@ -438,7 +438,7 @@ def _softened(panorama: NDArray[np.float64]) -> NDArray[np.float32]:
     import cv2
 
     width = panorama.shape[1]
-    # Three copies side by side, so that there is no seam at the back.
+    # Three copies side by side avoid a seam at the back.
     blurred = cv2.GaussianBlur(np.tile(panorama, (1, 3, 1)).astype(np.float32), (0, 0), 2)
     return np.asarray(blurred, dtype=np.float32)[:, width : 2 * width]
 

@@ -1,4 +1,4 @@
-"""LiDAR surfaces of a scene: Gaussians made from the recorded sweeps."""
+"""LiDAR surfaces of a scene: Gaussians learned from the recorded sweeps."""
 
 from .rays import RecordedRays, recorded_rays
 from .surfaces import SurfacesReport, fit_lidar_surfaces

@@ -21,16 +21,16 @@ from .rays import RecordedRays
 
 # --- Loss of rays ---------------------------------------------------------------------------------
 
-# A ray that stops at the measured return costs nothing. One that stops elsewhere costs by its
-# error, up to REACH; one that does not stop costs in full. So Gaussians in front of a return become
-# transparent (line of sight), those at the return become opaque and move along their normals.
+# The cost of a ray is 0 at the measured return, grows with the error up to REACH, and is 1 if the
+# ray does not stop. As a result, Gaussians in front of a return become transparent (line of sight),
+# and those at the return become opaque and move along their normals.
 # Kernels take arrays by position: Numba supports neither dataclasses nor keyword-only arguments.
 #
 # ruff: noqa: PLR0917
 
 
 REACH = 0.3
-"""Light that stops farther off costs in full [m]."""
+"""Range error from which the cost is 1 [m]."""
 LOGIT, SIZE, SHIFT = 0, 1, 2
 """Columns of gradients: of the opacity's logit, of the logarithm of the scales along the surface,
 of a shift along the normal [1/m]."""
@@ -43,7 +43,7 @@ def ray_gradients(
     """Gradients of the cost of each ray with respect to its hits.
 
     Args:
-        begins, members, alpha, tau: of RayHits.
+        begins, members, alpha, tau: fields of RayHits.
         measured: [R] float64, range of each ray [m].
         directions: [bodies, R, 3] float32, unit, in the frame of each body.
         body_of: [N] int32, body of each Gaussian.
@@ -59,7 +59,7 @@ def ray_gradients(
             light *= 1.0 - alpha[entry]
         cost += light
         costs[ray] = cost
-        # Remaining cost behind an entry: the cost if its light had passed.
+        # Remaining cost behind an entry: the cost if the light had passed it.
         left, light = cost, 1.0
         for entry in range(begins[ray], begins[ray + 1]):
             share, member = alpha[entry], members[entry]
@@ -95,7 +95,7 @@ class SurfaceTable:
     """Flat Gaussians of all bodies; the last axis of each is its normal.
 
     Attributes:
-        object_ids: of the bodies after the background.
+        object_ids: ids of the bodies after the background.
         firsts: [bodies + 1] int64, first Gaussian of each body.
         means, quats, axes, scales: [N, 3], [N, 4], [N, 3, 3] and [N, 3] float32, initial values.
         logit, size, shift: [N] float32, learnt: logit of the opacity, logarithm of the factor of
@@ -138,7 +138,7 @@ class SurfaceTable:
 
     @property
     def opacities(self) -> Array:
-        """[N] as learned."""
+        """[N], the learned opacities."""
         return np.minimum(1 / (1 + np.exp(-self.logit)), MAX_OPAQUE).astype(np.float32)
 
     @property
@@ -148,7 +148,7 @@ class SurfaceTable:
         return np.repeat(bodies, np.diff(self.firsts))
 
     def placed(self, scene: Scene, incidence: float = 1.0) -> Scene:
-        """The scene with this set for LiDARs."""
+        """The scene with these surfaces for LiDARs."""
         wide = np.exp(self.size)[:, None]
         scales = np.concatenate([self.scales[:, :2] * wide, self.scales[:, 2:]], axis=1)
         means = self.means + self.axes[:, :, 2] * self.shift[:, None]
@@ -187,7 +187,7 @@ class SweepHits:
 
     Attributes:
         hits: see :class:`RayHits`.
-        request: of the cast.
+        request: request of the cast.
         bodies: numbers of the bodies in the order of the request.
         of_request: [M] int32, the Gaussians numbered as in the request.
     """
@@ -225,7 +225,7 @@ def trace(
 
 
 def part_of(lidar: Lidar, rays: NDArray[np.int64]) -> Lidar:
-    """The LiDAR with these of its rays alone."""
+    """The LiDAR reduced to the selected rays."""
     beams = lidar.beams
     chosen = Beams(beams.azimuth[rays], beams.elevation[rays], beams.time_us[rays])
     return replace(lidar, beams=chosen)
@@ -236,7 +236,7 @@ def part_of(lidar: Lidar, rays: NDArray[np.int64]) -> Lidar:
 RAYS = 30_000
 """Rays per step, evenly spread over a sweep."""
 BEYOND = 0.5
-"""How far behind its return a ray is followed [m]."""
+"""Distance behind its return up to which a ray is traced [m]."""
 RATES = {LOGIT: 0.15, SIZE: 0.03, SHIFT: 0.0015}
 BOUNDS = {LOGIT: (-6.0, 4.6), SIZE: (-1.5, 0.5), SHIFT: (-0.05, 0.05)}
 INERTIA, SCATTER = 0.9, 0.99
@@ -248,11 +248,11 @@ class SeenSweep:
     """A sweep to learn from.
 
     Attributes:
-        frame: of the log.
-        rays: with a return.
+        frame: frame of the log.
+        rays: rays with a return.
         ring: [R] int32, of each ray; -1 for rays without a ring.
         elevations: [B] of the rings [rad]; [0] if the scan has no rings.
-        missing: rays that were fired and did not return, if the scan has rings.
+        missing: rays that were fired but did not return, if the scan has rings.
     """
 
     frame: int
@@ -271,10 +271,11 @@ def learn_surfaces(
     steps: int,
     on_step: Callable[[int, int], None],
 ) -> float:
-    """Learn opacity, size and shift of each Gaussian in place; returns the mean cost of the last
+    """Learn opacity, size and shift of each Gaussian in place; return the mean cost of the last
     rays.
 
-    Each step uses a part of the rays of one sweep, in turn. The same input gives the same bits.
+    Each step uses a part of the rays of one sweep, in turn. The result is deterministic, bit for
+    bit.
     """
     moments = {column: _Moments.of(len(table)) for column in RATES}
     order = np.random.default_rng(0).permutation(len(sweeps))
@@ -344,7 +345,7 @@ def _directions(table: SurfaceTable, met: SweepHits) -> NDArray[np.float32]:
 
 @dataclass(frozen=True, eq=False)
 class _Moments:
-    """Adam for the Gaussians that a step sees."""
+    """Adam for the Gaussians hit in a step."""
 
     mean: NDArray[np.float32]
     square: NDArray[np.float32]
@@ -367,7 +368,7 @@ class _Moments:
         mean = INERTIA * self.mean[seen] + (1 - INERTIA) * gradient
         square = SCATTER * self.square[seen] + (1 - SCATTER) * gradient**2
         self.mean[seen], self.square[seen] = mean, square
-        # The youth of both sums.
+        # Bias correction of both moments.
         mean = mean / (1 - INERTIA ** self.steps[seen])
         square = square / (1 - SCATTER ** self.steps[seen])
         values[seen] -= (rate * mean / (np.sqrt(square) + 1e-8)).astype(np.float32)

@@ -20,7 +20,7 @@ from ...scene.range_sensors import wrapped
 FAR = 250.0
 """Recorded points beyond this range are dropped [m]."""
 DETECTS_ALL = Detection(range_m=2000.0, reflectivity=1e-6)
-"""The limit of the sensor is unknown; the scene determines where beams are lost."""
+"""Assumed maximum range: the sensor's limit is unknown, so the scene determines lost beams."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +31,7 @@ class RecordedRays:
         lidar: a table of these rays.
         range: [R] float64 [m].
         intensity: [R] float32.
-        points: [R, 3] float64, in the world, where each was measured [m].
+        points: [R, 3] float64, measured positions in the world [m].
     """
 
     lidar: Lidar
@@ -40,7 +40,7 @@ class RecordedRays:
     points: Float
 
     def select(self, kept: NDArray[np.bool_]) -> RecordedRays:
-        """The rays of a mask, in their order."""
+        """The rays selected by a mask, in order."""
         beams = self.lidar.beams
         chosen = Beams(beams.azimuth[kept], beams.elevation[kept], beams.time_us[kept])
         lidar = replace(self.lidar, beams=chosen)
@@ -92,23 +92,23 @@ def _shift(origin: NDArray[np.float32]) -> Float:
 
 # The beam table, estimated from raw scans.
 #
-# Scans of some data sets list one ring after the other, each from the same azimuth on. A drop in
-# azimuth starts a new ring. The sensor may be tilted on its vehicle: rays of a ring lie on a cone
-# about the sensor's axis, the direction of least scatter about the mean. The lasers leave the
-# sensor at different heights, so a ring is the line z = offset + slope rho.
+# Scans of some data sets list ring after ring, each starting at the same azimuth, so a drop in
+# azimuth starts a new ring. The sensor may be tilted on its vehicle: the rays of a ring form a cone
+# about the sensor's axis, the direction of least scatter about the mean. The laser origins differ
+# in height, so a ring is the line z = offset + slope rho.
 
 RING_STEP = np.pi
-"""A step back by more than this is the begin of a ring [rad]."""
+"""Minimum drop in azimuth that starts a ring [rad]."""
 MIN_RING = 50
-"""Fewer points make no ring."""
+"""Minimum number of points of a ring."""
 ROUNDS = 5
-"""Rounds of dropping the farthest points of a ring and fitting again."""
+"""Rounds of dropping outliers of a ring and refitting."""
 HEIGHT_STEP = 0.05
 """Lasers with a smaller height difference have the same origin [m]."""
 MIN_STEP = 1e-4
 """Minimum azimuth step of a rotating sensor [rad]."""
 NOT_ONE = np.radians(0.35)
-"""Elevations of a ring scatter less than this [rad], or the scan is not by rings."""
+"""Maximum scatter of the elevations of a ring [rad]. Scans with more are not ordered by ring."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,11 +118,11 @@ class Rings:
     Attributes:
         elevation: [B] of each ring, in scan order [rad].
         offset: [B] of each ring's origin above the sensor's [m].
-        residual: root mean square of the points' elevations about their rings', seen from the
-            ring's origin [rad], without the farthest twentieth.
+        residual: root mean square of the points' elevation error about their ring, seen from the
+        ring's origin [rad], without the worst 5 %.
         ring: [R] int32, of each ray; -1 for rays without a ring.
         columns: azimuth steps per turn.
-        clockwise: seen from above.
+        clockwise: whether the sensor rotates clockwise seen from above.
         T_vehicle_lidar: [4, 4], rotated so that z is the axis.
         azimuth, height: [R] of each ray about that axis, and of its ring [rad].
     """
@@ -138,7 +138,7 @@ class Rings:
     height: Float
 
     def beams(self, rays: RecordedRays) -> Beams:
-        """The grid of rings by columns, each column at the time at which ``rays`` were there."""
+        """The grid of rings by columns; each column has the time of ``rays`` at its azimuth."""
         slope, start = _turn(self.azimuth, rays.lidar.beams.time_us)
         azimuth = wrapped(-np.pi + 2 * np.pi * (np.arange(self.columns) + 0.5) / self.columns)
         order = np.argsort(wrapped(azimuth - start) * np.sign(slope), kind="stable")
@@ -152,10 +152,10 @@ class Rings:
         )
 
     def missing(self, rays: RecordedRays) -> list[Lidar]:
-        """Rays of ``rays``' sweep that were fired and did not return.
+        """Rays of the sweep that were fired but did not return.
 
         A ring fires at uniform azimuth steps, so gaps between its returns give the number of lost
-        rays. One LiDAR for each height of the lasers' origins.
+        rays. Returns one LiDAR for each height of the laser origins.
         """
         heights = np.round(self.offset / HEIGHT_STEP).astype(int)
         slope, start = _turn(self.azimuth, rays.lidar.beams.time_us)
@@ -175,7 +175,7 @@ class Rings:
 
 
 def _gaps(azimuth: Float) -> Float:
-    """Azimuths of the lost rays of a ring, in firing order, at its uniform steps."""
+    """Azimuths of the lost rays of a ring, in firing order, at uniform steps."""
     turned = np.unwrap(azimuth)
     closed = np.append(turned, turned[0] + 2 * np.pi * np.sign(turned[-1] - turned[0]))
     away = np.diff(closed)
@@ -225,8 +225,7 @@ def fit_rings(rays: RecordedRays) -> Rings | None:
 
 
 def _cones(points: Float, ring: NDArray[np.int32]) -> tuple[Float, Float, Float]:
-    """Slope and offset [B] of each ring, and how far [rad] its points are off, without the
-    farthest twentieth."""
+    """Slope and offset [B] of each ring, and its error [rad] without the worst 5 % of points."""
     rho = np.maximum(np.hypot(points[:, 0], points[:, 1]), 1e-3)
     count = int(ring.max()) + 1
     slopes, offsets, off = np.zeros(count), np.zeros(count), []

@@ -17,10 +17,10 @@ from .learn import SeenSweep, SurfaceTable, part_of, trace
 
 # Reflectivity from recorded intensities.
 #
-# A recorded intensity is the light that the surfaces along a ray return, weighted by the share
-# that each stops, times the sensor's response. Surfaces reflect partly diffusely in all directions
-# and partly with the cosine of incidence; the share is one number for a scene. Lasers of one
-# sensor respond differently, depending on range: each ring has its own gain and offset by range.
+# A recorded intensity is the light returned by the surfaces along a ray, weighted by the share that
+# each one stops, times the sensor's response. Part of the reflection is independent of the
+# incidence, the rest follows its cosine; a scene has one value for this share. The response of a
+# laser depends on the range: each ring has a gain and an offset per range step.
 
 RAYS = 60_000
 """Rays per sweep, evenly spread."""
@@ -29,14 +29,14 @@ LITTLE = 0.01
 INCIDENCES = (1.0, 0.8, 0.6, 0.4, 0.25, 0.15)
 """Candidate shares of light that is independent of the incidence; the best one is used."""
 PRIOR = 0.5
-"""Light that the mean reflectivity of all counts for."""
+"""Weight of the mean reflectivity as a prior, in units of light."""
 TRUST = 20.0
-"""Rays that a ring's answer being like the others' counts for."""
+"""Weight of the prior that all rings respond alike, in rays."""
 ROUNDS, INNER = 5, 4
 DARKEST = 1e-3
-"""What returned reflects something."""
+"""Minimum reflectivity: every surface with a return reflects some light."""
 UNKNOWN = 0.3
-"""Reflectivity if no sweep hit anything in a scene."""
+"""Reflectivity of a scene in which no sweep hit anything."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +45,7 @@ class FittedReflectivity:
 
     Attributes:
         incidence: see ``LidarSurfaces``.
-        response: of the rings; None if sweeps have no rings.
+        response: response of the rings; None if sweeps have no rings.
         known: share of the Gaussians that a ray hit.
         residual: root mean square of recorded minus explained intensities.
     """
@@ -88,7 +88,7 @@ def light_of(
     *,
     on_sweep: Callable[[int, int], None],
 ) -> LitRays:
-    """Follow the rays of all sweeps until their light has gone."""
+    """Trace the rays of all sweeps until their light is exhausted."""
     placed = table.placed(scene)
     rings = sweeps[0].elevations
     columns: list[tuple[NDArray[Any], ...]] = []
@@ -192,11 +192,11 @@ def _reflectivities(
     gain: NDArray[np.float64],
     offset: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """A few rounds of simultaneous iterative reconstruction (SIRT) from ``values`` [N] on."""
+    """A few rounds of simultaneous iterative reconstruction (SIRT), starting at ``values`` [N]."""
     one = len(gain) == 1
     factor = lambert if one else lambert * gain[lit.cell][lit.ray]
     wanted = lit.intensity if one else lit.intensity - offset[lit.cell]
-    # Each hit is weighted by its share: by the light on the Gaussian, not only by its own part.
+    # Each hit is weighted by its share, the light on the Gaussian.
     light = np.bincount(lit.member, factor * factor / np.maximum(lit.share, 1e-6), len(values))
     mean = float(np.average(values, weights=light)) if light.sum() > 0 else UNKNOWN
     for _ in range(INNER):
@@ -253,7 +253,7 @@ def _line(
 # not, where the rings of a scan reveal the fired rays.
 
 LOSS_PRIOR = 0.5
-"""Light that the mean share of all counts for."""
+"""Weight of the mean loss as a prior, in units of light."""
 LOSS_ROUNDS = 8
 
 
@@ -276,7 +276,7 @@ def fit_losses(
     placed, before = table.placed(scene), returned
     for done, (sweep, every) in enumerate(zip(sweeps, lit.every, strict=True)):
         for lidar in sweep.missing:
-            # As many as of those that returned, or shares would be wrong.
+            # The same stride as for returned rays, so that the shares are unbiased.
             chosen = np.arange(0, lidar.beams.count, every)
             met = trace(
                 table, placed, log, frame=sweep.frame, lidar=part_of(lidar, chosen),

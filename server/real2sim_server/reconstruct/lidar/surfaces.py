@@ -1,4 +1,4 @@
-"""The Gaussians that LiDARs see: flat, learned from sweeps, with a reflectivity each."""
+"""Gaussians seen by LiDARs: flat, learned from sweeps, each with a reflectivity."""
 
 from __future__ import annotations
 
@@ -30,27 +30,28 @@ from .learn import SeenSweep, SurfaceTable, learn_surfaces
 from .rays import RecordedRays, fit_rings, recorded_rays
 from .reflectivity import fit_losses, fit_reflectivity, light_of
 
-# Flat Gaussians on the measured points, background and objects apart.
+# Flat Gaussians on the measured points, separate for background and objects.
 
 VOXEL, VOXEL_PER_METRE = 0.1, 0.006
 """Edge of voxels in the background [m], and its growth with the distance from the drive."""
 OBJECT_VOXEL = 0.05
 MAX_BACKGROUND, MAX_OBJECT = 300_000, 40_000
 MAX_OBJECT_SURFEL = 0.15
-"""Scale along surfaces of objects, at most [m]."""
+"""Maximum scale along surfaces of objects [m]."""
 MIN_SCALE = 0.004
 """Minimum scale along normals [m]; beams measure to millimetres."""
 FLATTER = 0.3
-"""Remaining share of the thickness of neighbourhoods; most of it is noise of single beams."""
+"""Kept share of the thickness of neighbourhoods. The rest is beam noise."""
 ROAD_BAND = 0.05
-"""Points in a box at most so high over its bottom are road [m]."""
+"""Maximum height of road points above the bottom of a box [m]."""
 MOVES = 0.3
-"""An object with a longer path moves, and parts outside its box move with it [m]."""
+"""Extent of a trajectory above which its object counts as moving, with nearby points [m]."""
 BOX_MARGIN = 0.12
 GAP, GAP_PER_METRE = 0.3, 0.01
-"""Surfaces of the scene count where nothing was measured so near [m], with distance more."""
+"""Scene surfaces are used where no point was measured within this distance [m], which grows with
+the range."""
 FAR = 120.0
-"""Returns from farther are too sparse for surfaces [m]."""
+"""Maximum range of returns used for surfaces [m]. Farther ones are too sparse."""
 THIN_EVERY = 4_000_000
 OPACITY = 0.95
 
@@ -148,7 +149,7 @@ def _margin(track: ObjectTrack) -> float:
 def _filled(
     points: PointSet, surfels: Surfels, completion: GaussianCloud, away: NDArray[np.float32]
 ) -> GaussianCloud:
-    """Gaussians of surfels, and those of a completion [M] that have no point near them."""
+    """Gaussians of surfels, and the Gaussians of a completion [M] without a point nearby."""
     from scipy.spatial import cKDTree
 
     means = completion.means.numpy()
@@ -174,7 +175,7 @@ def _filled(
 
 # The complete set.
 #
-# Training on images leaves haze around surfaces, and a beam would measure it. Surfaces are
+# Training on images leaves haze around surfaces that a beam would measure. LiDAR surfaces are
 # therefore placed on the measured points, completed from the scene elsewhere, and learned from the
 # rays. Reflectivity is fitted last.
 
@@ -195,9 +196,9 @@ WITHOUT_LOOKS = InitialiseOptions(
     sky_resolution=32,
     lanes="none",
 )
-"""Shapes alone, for where no beam measured anything: beams see no colours."""
+"""Default options of the completion: shapes without colours, because beams do not see colours."""
 MIN_OPACITY = 0.02
-"""Gaussians with less opacity are removed at the end."""
+"""Minimum opacity. Gaussians below it are removed at the end."""
 
 
 @dataclass(frozen=True)
@@ -210,7 +211,7 @@ class SurfacesReport:
         held_out: frames that were not used.
         known: share of the Gaussians that a recorded beam hit.
         incidence: share of reflected light that is independent of the incidence.
-        cost: of the last rays, 0 if all light stops at the measured return, 1 if none does.
+        cost: mean over the last rays, 0 if all light stops at the measured return, 1 if none does.
         intensity_residual: root mean square of the unexplained intensities.
         timing_s: seconds by stage.
     """
@@ -237,12 +238,12 @@ def fit_lidar_surfaces(
     """Add Gaussians for LiDARs to a scene, fitted to ``log`` without its held-out frames.
 
     Args:
-        scene: made from ``log``.
-        log: with LiDAR sweeps.
-        surfaces: fills the places that no beam measured: the result of ``initialise_scene`` on the
+        scene: scene made from ``log``.
+        log: log with LiDAR sweeps.
+        surfaces: fills regions that no beam measured: the result of ``initialise_scene`` on the
             same frames. Training saves it as ``initial.r2s`` in its folder. Built by default.
-        options: of the surfaces, see ``initialise_scene``; by default shapes alone.
-        steps: of learning; each takes about a second of one core.
+        options: options of ``surfaces``, see ``initialise_scene``; by default only shapes.
+        steps: number of learning steps; each takes about a second of one core.
         on_progress: called with the stage, completed and total steps.
 
     Raises:
@@ -304,14 +305,14 @@ def fit_lidar_surfaces(
 
 
 def held_out_of(scene: Scene) -> set[int]:
-    """Frames of its log that a scene was made without."""
+    """Frames of the log that the scene was made without."""
     made = scene.provenance.get("reconstruction")
     listed = made.get("held_out_frames") if isinstance(made, dict) else None
     return set(listed) if isinstance(listed, list) else set()
 
 
 def _check_objects(scene: Scene, surfaces: Scene) -> None:
-    """Objects are matched by number, so both scenes must have the same."""
+    """Check that both scenes have the same objects, which are matched by number."""
     of_scene, of_log = tuple(scene.objects), tuple(surfaces.objects)
     if of_scene != of_log:
         differ = sorted(set(of_scene) ^ set(of_log))[:5]
@@ -322,7 +323,7 @@ def _check_objects(scene: Scene, surfaces: Scene) -> None:
 
 
 def _seen(frame: int, rays: RecordedRays, met: NDArray[np.bool_]) -> SeenSweep:
-    """A sweep with those of its rays that met anything but the recording vehicle itself."""
+    """A sweep with the rays that hit something other than the recording vehicle."""
     rings = fit_rings(rays)
     if rings is None:
         none = np.full(int(met.sum()), -1, np.int32)

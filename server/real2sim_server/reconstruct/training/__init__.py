@@ -1,4 +1,4 @@
-"""Training: from the scene of stage 0 to one that renders like the log."""
+"""Training: optimises the scene of stage 0 until it renders like the log."""
 
 from .data import held_out_frames, training_log
 from .densify import DensifyOptions

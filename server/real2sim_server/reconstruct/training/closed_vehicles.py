@@ -1,6 +1,7 @@
-"""Close vehicles where no image shows them.
+"""Complete the parts of vehicles that no image shows.
 
-The body that fits a vehicle's box fills in, with its paint, where no image shows trained Gaussians.
+The body fitted into a vehicle's box fills the unseen parts, in the vehicle's paint.
+
 If all images look along one direction, they do not determine depth: the tail of a followed vehicle
 is learnt as a cloud metres deep and falls apart when the vehicle turns. This module projects that
 cloud along the viewing rays onto the body, with almost no change to the images.
@@ -38,9 +39,9 @@ ONE_DIRECTION = float(np.radians(5))
 KEPT_DEPTH = 0.05
 """Remaining fraction of the depth about a surface, so that the order in depth is preserved."""
 HIT = 0.07
-"""A ray that passes a point of a surface this close hits it [m]."""
+"""Maximum distance of a ray from a surface point that it hits [m]."""
 LAYER = 0.15
-"""Points of a surface at most so much deeper than the first one hit belong to it [m]."""
+"""Maximum depth behind the first hit point of points on the same surface [m]."""
 EDGE_ON = 0.2
 """Gaussians follow the surface up to this cosine between normal and ray; beyond it they face the
 ray.
@@ -50,9 +51,10 @@ MIN_SPREAD = 2e-3
 SHADOW = 0.3
 """The ground plate that carries shadows extends this far beyond the box [m]."""
 INSETS = (1.0, 0.96, 0.92, 0.87, 0.82)
-"""A body may be this much narrower and lower, where images show it beyond a vehicle's outline."""
+"""Factors by which a body may be narrower and lower where images show it beyond the vehicle's
+outline."""
 DISC = (0.7, 0.7, 0.15)
-"""Standard deviations of a body's Gaussians, by the distance between them."""
+"""Standard deviation of a body's Gaussians, relative to their spacing."""
 ROWS = 2000
 
 
@@ -66,7 +68,7 @@ def close_followed(
     """Project followed vehicles onto their bodies, in place.
 
     Args:
-        bodies: of the objects; None for objects without a body.
+        bodies: bodies of the objects; None for objects without a body.
 
     Returns:
         Whether each object was projected.
@@ -89,7 +91,7 @@ def offer_bodies(
     Args:
         followed: per object, whether only its outline determines its width; such bodies are offered
             in several INSETS.
-        bodies: of the objects; None for objects without a body.
+        bodies: bodies of the objects; None for objects without a body.
     """
     scene = model.scene
     reconstruction = scene.provenance.get("reconstruction")
@@ -117,12 +119,12 @@ def body_cloud(
     palette: NDArray[np.float32],
     insets: Sequence[float],
 ) -> GaussianCloud:
-    """The whole of a body once for each inset, in the paint that ``item`` shows.
+    """The whole body once for each inset, in the paint of ``item``.
 
-    Where it is flat and of one part, few and larger Gaussians do.
+    Flat regions of a single part get fewer, larger Gaussians.
 
     Args:
-        item: of stage 0.
+        item: object of stage 0.
         light: slopes [3] in its frame, see :func:`.vehicle_parts.fit_light`.
         palette: colours [10, 3] of parts, see :func:`.vehicle_parts.fit_palette`.
     """
@@ -154,7 +156,7 @@ def _no_choice(count: int) -> Tensor:
 
 
 def _followed_rows(model: SceneModel, seen: ViewingDirections, index: int) -> Tensor:
-    """Gaussians [M] of an object that images show, where they show it from one direction."""
+    """Gaussians [M] of an object that images show from one direction only."""
     starts = model.gaussians.starts
     rows = torch.arange(starts[index + 1], starts[index + 2], device=model.device)
     rows = rows[seen.views[rows] > 0]

@@ -19,15 +19,15 @@ from ..options import ReconstructError
 from .schedule import TrainOptions
 
 NEAR, FAR = 0.5, 80.0
-"""LiDAR depths outside are not compared [m]."""
+"""Range of the compared LiDAR depths [m]."""
 SKY_BORDER = 3.0
 """Width of the border of the sky mask with reduced weight [px]."""
 PREFETCH = 4
-"""Images that are decoded ahead of the step that takes them."""
+"""Number of images decoded ahead of their step."""
 
 
 def held_out_frames(frame_count: int, every: int) -> list[int]:
-    """Frames excluded from training: the third of every ``every``; none for ``every`` = 0.
+    """Frames excluded from training: the third of each group of ``every``; none for ``every`` = 0.
 
     If ``every`` is 4 or more, neither the first nor the last frame of a drive is held out, so every
     held-out frame is between two training frames.
@@ -38,7 +38,7 @@ def held_out_frames(frame_count: int, every: int) -> list[int]:
 
 
 def training_log(log: DrivingLog, hold_out: int) -> DrivingLog:
-    """``log`` without the held-out frames; paths and boxes stay whole."""
+    """``log`` without the held-out frames. Paths and boxes stay complete."""
     held_out = set(held_out_frames(log.frame_count, hold_out))
     return log_of_frames(log, [f for f in range(log.frame_count) if f not in held_out])
 
@@ -48,7 +48,7 @@ class TrainingView:
     """One training image.
 
     Attributes:
-        camera: at the size of ``image``.
+        camera: camera at the size of ``image``.
         frame: index in the log.
         t_us: time of the image [us].
         image: [H, W, 3] float32 in [0, 1].
@@ -85,10 +85,10 @@ class TrainingViews:
     Decoded images are cached up to ``options.image_bytes``; the least recently used are evicted.
 
     Args:
-        log: with cameras.
+        log: log with cameras.
         frames: indices into ``log``.
         options: training options.
-        device: of the returned views. A device other than the CPU caches the views as bytes, also
+        device: device of the returned views. Other devices than the CPU cache views as bytes, also
             up to ``options.image_bytes``, so that later epochs copy nothing.
 
     Raises:
@@ -145,7 +145,7 @@ class TrainingViews:
         return [viewpoints[by_camera[int(place)]] for place in places]
 
     def index_at(self, iteration: int) -> int:
-        """Index of the view of ``iteration``: all in random order, then all in another."""
+        """Index of the view of ``iteration``. Every epoch visits all views in a new order."""
         epoch, place = divmod(iteration, len(self))
         rng = np.random.Generator(np.random.Philox(key=[self._options.seed, epoch]))
         return int(rng.permutation(len(self))[place])

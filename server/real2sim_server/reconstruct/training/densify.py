@@ -88,7 +88,7 @@ class SelectiveAdam:
         )
 
     def gather(self, name: str, source: Tensor, fresh: Tensor) -> None:
-        """Follow a change of rows: new row i was row ``source[i]``; ``fresh`` rows get zero
+        """Apply a change of rows: new row i was row ``source[i]``; ``fresh`` rows get zero
         moments.
 
         Args:
@@ -120,7 +120,7 @@ class SelectiveAdam:
 
 def _update_plain(views: list[Tensor], seen: Tensor, columns: Tensor, correction: float) -> None:
     values, gradient, first, second = views
-    # Chosen by where, not by index: an index of unknown length would be waited for.
+    # torch.where avoids the device synchronisation of a boolean index.
     rows = seen[:, None]
     m = torch.where(rows, 0.9 * first + 0.1 * gradient, first)
     v = torch.where(rows, 0.999 * second + 0.001 * gradient * gradient, second)
@@ -142,7 +142,7 @@ MAX_COPIES = 51
 
 
 def step_generator(seed: int, iteration: int) -> np.random.Generator:
-    """Noise that depends on seed and iteration alone, so that a resumed run draws the same."""
+    """Random generator of seed and iteration only, so that a resumed run is identical."""
     return np.random.Generator(np.random.Philox(key=[seed, (1 << 40) + iteration]))
 
 
@@ -162,7 +162,7 @@ def refine(
         duplicate: [N] bool, get a copy with zero moments.
         split: [N] bool, are replaced by two smaller ones at random positions within the original.
         prune: [N] bool, are removed; disjoint from the other masks.
-        rng: places the halves.
+        rng: samples the positions of the halves.
     """
     kept = (~prune & ~split).nonzero()[:, 0]
     copies, halves = duplicate.nonzero()[:, 0], split.nonzero()[:, 0].repeat(2)
@@ -176,7 +176,7 @@ def refine(
 
 
 def _scatter(gaussians: Gaussians, halves: Tensor, rng: np.random.Generator) -> None:
-    """Draw the places of ``halves`` from the Gaussians they came from, and shrink them."""
+    """Sample the positions of ``halves`` from their original Gaussians, and shrink them."""
     scales = gaussians.log_scales[halves].exp()
     noise = rng.standard_normal((len(halves), 3), dtype=np.float32)
     offset = torch.from_numpy(noise).to(scales.device) * scales
@@ -209,7 +209,7 @@ def relocate(
     Args:
         dead: [N] bool.
         count: number of Gaussians afterwards; at least the number of live ones.
-        min_opacity: of copies.
+        min_opacity: minimum opacity of copies.
         rng: samples the Gaussians to copy.
     """
     live = (~dead).nonzero()[:, 0]
@@ -240,7 +240,7 @@ def sample_by_weight(weights: Tensor, count: int, rng: np.random.Generator) -> T
 def compute_relocation(
     opacities: Tensor, copies: Tensor, min_opacity: float
 ) -> tuple[Tensor, Tensor]:
-    """Opacity [M] of each of ``copies`` [M] that look together like one, and factor on its size.
+    """Opacity [M] of each of ``copies`` [M] that together look like one, and their size factor.
 
     Kheradmand et al. 2024, eq. 9.
     """
@@ -272,7 +272,7 @@ def inject_noise(
 
     Args:
         rate: learning rate of the means [m].
-        strength: of the noise, relative to the rate.
+        strength: strength of the noise, relative to the rate.
         min_opacity: opacity around which the noise fades out.
     """
     drawn = rng.standard_normal((len(gaussians), 3), dtype=np.float32)
@@ -319,7 +319,7 @@ def rotation_matrices(quats: Tensor) -> Tensor:
     return torch.stack([torch.stack(row, -1) for row in rows], -2)
 
 
-# Strategies: when to add and remove which Gaussians.
+# Strategies for adding and removing Gaussians.
 #
 # The trainer calls a strategy twice a step, as in gsplat: :meth:`Strategy.step_pre_backward` with
 # the render and :meth:`Strategy.step_post_backward` after the optimiser's step.
@@ -358,13 +358,13 @@ class DensifyOptions:
         min_opacity: Gaussians below it are removed, or moved by ``mcmc``.
         max_scale: larger ones near the drive are removed [m].
         reset_every: iterations between resets of opacity; 0 for never.
-        noise: of ``mcmc``: factor on the learning rate of means.
-        growth: of ``mcmc``: relative growth of the number per round.
+        noise: for ``mcmc``, factor on the learning rate of means.
+        growth: for ``mcmc``, relative growth of the number per round.
         hidden_rounds: fractions of all iterations at which hidden Gaussians are pruned.
         prior_round: fraction of all iterations at which they are pruned again and replaced by
             priors of stage 0; the surfaces in front close up in the remaining iterations.
-        background_limits: of hidden Gaussians in the background.
-        object_limits: of hidden Gaussians in objects.
+        background_limits: limits of hidden Gaussians in the background.
+        object_limits: limits of hidden Gaussians in objects.
         last_background_limits: additional limits in the prior round, for background no higher than
             the objects: Gaussians metres behind the visible surfaces were learnt through gaps in
             them, and become visible when an object is deleted.
@@ -413,7 +413,7 @@ class ScreenSums:
 
     @classmethod
     def zeros(cls, count: int, device: torch.device | str = "cpu") -> ScreenSums:
-        """For ``count`` Gaussians that were not visible yet."""
+        """Empty statistics of ``count`` Gaussians."""
         return cls(torch.zeros(count, 2, device=device), torch.zeros(count, device=device))
 
     def add(self, rows: list[slice], screen: ScreenStatistics) -> None:
@@ -429,7 +429,7 @@ class TrainingStep:
 
     Attributes:
         iteration: counted from 0.
-        rows: of the Gaussians of each rendered instance.
+        rows: rows of the Gaussians of each rendered instance.
         screen: their positions on the image, with gradients.
         means_rate: learning rate of the means in this step [m].
     """
@@ -449,8 +449,8 @@ class Strategy:
     Args:
         options: see :class:`DensifyOptions`.
         half_sizes: [I, 3] half the sizes of the objects' boxes [m], on the Gaussians' device.
-        seed: of all noise, together with the iteration.
-        iterations: of the whole training.
+        seed: seed of all noise, together with the iteration.
+        iterations: iterations of the whole training.
     """
 
     def __init__(
@@ -464,7 +464,7 @@ class Strategy:
         self._last = round(options.stop * iterations)
 
     def initialize_state(self, count: int) -> None:
-        """Begin anew for ``count`` Gaussians, after something else changed the set."""
+        """Restart the statistics for ``count`` Gaussians after an external change of the set."""
         self.state = ScreenSums.zeros(count, self._half_sizes.device)
 
     def step_pre_backward(self, output: RenderOutput) -> None:
@@ -547,7 +547,7 @@ class GradientStrategy(Strategy):
             reset_opacity(gaussians, optimizer)
 
     def _growing(self, gaussians: Gaussians, dead: Tensor) -> Tensor:
-        """[N] bool: the strongest gradients above the threshold, as many as the budget allows."""
+        """[N] bool: the strongest gradients above the threshold, within the budget."""
         options, background = self.options, gaussians.counts[0]
         mean = self.state.gradients / self.state.views.clamp(min=1)[:, None]
         excess = mean.new_empty(len(gaussians))
@@ -564,7 +564,7 @@ class GradientStrategy(Strategy):
 
 
 class McmcStrategy(Strategy):
-    """Moves dead Gaussians to live ones, and all of them by noise (Kheradmand et al. 2024)."""
+    """Relocates dead Gaussians to live ones and adds noise to all (Kheradmand et al. 2024)."""
 
     @torch.no_grad()
     def step_post_backward(
@@ -599,4 +599,4 @@ STRATEGIES: dict[str, type[Strategy]] = {
     "gradient": GradientStrategy,
     "mcmc": McmcStrategy,
 }
-"""By the name that ``DensifyOptions.method`` gives."""
+"""Strategies by the name used in ``DensifyOptions.method``."""

@@ -18,8 +18,8 @@ from . import kernels
 
 # Activations: raw parameters to scales, opacities and colours, owner by owner.
 #
-# Torch would pass over the parameters a dozen times on one thread in each direction. The CPU
-# kernels take one pass each way; :func:`activated_plain` is the reference in plain torch.
+# The CPU kernels take one pass each way, compared with a dozen single-threaded passes in torch.
+# :func:`activated_plain` is the reference in plain torch.
 
 
 class Activated(NamedTuple):
@@ -160,7 +160,7 @@ def _array(tensor: Tensor) -> NDArray[np.float32]:
 
 FIELDS = ("means", "log_scales", "quats", "logits", "sh", "fourier")
 OBJECT_FIELDS = ("fourier",)
-"""Fields that only the Gaussians of objects have."""
+"""Fields of object Gaussians only."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,7 +237,7 @@ class Gaussians:
         Their quaternions are not normalised: every renderer normalises them.
 
         Args:
-            degree: of the spherical harmonics.
+            degree: degree of the spherical harmonics.
             tones: [M, F] basis values, weights of each object's Fourier part; None for none.
             mirrored: objects to reflect at their x z plane.
         """
@@ -304,10 +304,10 @@ def from_scene(
     """Raw parameters of a scene.
 
     Args:
-        sh_degree: of the spherical harmonics.
+        sh_degree: degree of the spherical harmonics.
         harmonics: F, number of basis functions of time-varying colours.
         initial_opacity: upper bound, so that all opacities can still learn.
-        device: of the parameters.
+        device: device of the parameters.
     """
     clouds = [scene.background, *(o.cloud for o in scene.objects.values())]
     clouds = [c.with_sh_degree(sh_degree) for c in clouds]
@@ -339,6 +339,6 @@ def _fourier(scene: Scene, rows: int, harmonics: int) -> Tensor:
 
 
 def leaf(tensor: Tensor, device: torch.device | str | None = None) -> Tensor:
-    """A contiguous float32 copy that requires gradients, on ``device`` or where it was."""
+    """A contiguous float32 copy that requires gradients, on ``device`` or the current one."""
     placed = tensor.detach() if device is None else tensor.detach().to(device)
     return placed.float().clone().contiguous().requires_grad_()

@@ -63,12 +63,12 @@ def activate_backward(
     by_sh,
     by_fourier,
 ):
-    """Write the gradients by the first four arguments of :func:`activate_rows`.
+    """Write the gradients with respect to the first four arguments of :func:`activate_rows`.
 
     Args:
-        by_scales, by_opacities, by_colours: gradients by what that wrote.
-        scales, opacities: what it wrote.
-        tones, starts: as given to it.
+        by_scales, by_opacities, by_colours: gradients with respect to its outputs.
+        scales, opacities: its outputs.
+        tones, starts: its inputs.
     """
     count, kept = by_colours.shape[:2]
     for chunk in prange((count + CHUNK - 1) // CHUNK):
@@ -214,7 +214,7 @@ def compare(blurred, window, sums, slopes):
             by_xx = -value / d
             by_xy = 2 * a * inverse
             by_mean = 2 * my * b * inverse - 2 * mx * value / c
-            # The variances hold the mean as well.
+            # The variances also depend on the mean.
             slopes[0, row, i] = by_mean - 2 * mx * by_xx - my * by_xy
             slopes[1, row, i] = by_xx
             slopes[2, row, i] = by_xy

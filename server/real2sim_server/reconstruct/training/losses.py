@@ -52,7 +52,7 @@ class LossWeights:
 
 
 class _Photometric(torch.autograd.Function):
-    """(1 - s) L1 + s (1 - SSIM) in one pass: the gradient is known as soon as the value is."""
+    """(1 - s) L1 + s (1 - SSIM), value and gradient in one pass."""
 
     @staticmethod
     def forward(ctx: Any, image: Tensor, truth: Tensor, fraction: float) -> tuple[Tensor, ...]:
@@ -199,10 +199,9 @@ def needles(log_scales: Tensor, ratio: float) -> Tensor:
 
 
 def second_differences(values: Tensor, times_s: NDArray[np.float64]) -> Tensor:
-    """Mean of squared second differences over rows of [T, D], as if rows were 0.1 s apart.
+    """Mean of squared second differences over rows of [T, D], scaled to intervals of 0.1 s.
 
-    Steady motion costs nothing however uneven the times [T] [s] are: frames are missing where
-    they are held out.
+    Uniform motion has no cost, even at uneven times [T] [s], for example around held-out frames.
     """
     if len(values) < 3:
         return values.sum() * 0

@@ -40,7 +40,7 @@ class ImageGains:
     Args:
         cameras: number of cameras.
         times_us: [K] int64 times of training images, increasing.
-        device: of the gains.
+        device: device of the gains.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class KeyPoses:
     Attributes:
         times_us: [T] int64 key times [us].
         positions, quaternions: [T, 3] and [T, 4] float64 of the input boxes.
-        first_row: of this object in the packed corrections.
+        first_row: first row of this object in the packed corrections.
     """
 
     times_us: NDArray[np.int64]
@@ -115,7 +115,7 @@ class ObjectPoses:
         key_times_us: [K] times of training frames. Images correct a pose only at these times;
             other times between the first and last pose of a track are interpolated from their
             neighbours. None keeps every pose of the trajectories.
-        device: of corrections and poses.
+        device: device of corrections and poses.
     """
 
     def __init__(
@@ -216,7 +216,7 @@ def _corrections(shift: Tensor, angles: Tensor) -> Tensor:
 
 
 def _about(axis: int, angle: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Quaternions [T, 4] wxyz of turns by ``angle`` [T] about one axis."""
+    """Quaternions [T, 4] wxyz of rotations by ``angle`` [T] about one axis."""
     quaternions = np.zeros((len(angle), 4))
     quaternions[:, 0], quaternions[:, 1 + axis] = np.cos(angle / 2), np.sin(angle / 2)
     return quaternions
@@ -233,7 +233,7 @@ def _key_times(trajectory: Trajectory, key_times_us: NDArray[np.int64] | None) -
 # The model: all trainable parameters, rendered for any logged view.
 
 SYMMETRIC_CATEGORIES = ("car", "truck", "van", "bus")
-"""Categories whose two sides look alike."""
+"""Categories with two similar sides."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -256,15 +256,15 @@ class SceneModel:
     """Trainable parameters of a scene.
 
     Attributes:
-        device: of the parameters and the renderer, so that no step moves them.
+        device: device of the parameters and the renderer, so that no step moves them.
         mirrored: per object, whether training sometimes shows its mirrored side.
-        priors: Gaussians that are rendered but not trained; None for none.
+        priors: Gaussians that are rendered but not trained, or None.
 
     Args:
-        scene: of stage 0; its cameras, ego path, boxes and times do not change.
+        scene: scene of stage 0; its cameras, ego path, boxes and times do not change.
         options: training options.
         key_times_us: [K] int64, times of training images, at which boxes can be refined.
-        backend: of the renderer.
+        backend: backend of the renderer.
     """
 
     def __init__(
@@ -300,7 +300,7 @@ class SceneModel:
         self.half_sizes = torch.from_numpy(np.array(half).reshape(-1, 3)).float().to(self.device)
 
     def stop_mirroring(self) -> None:
-        """Stop using images of a vehicle as evidence for its mirrored side."""
+        """Stop using images of vehicles as evidence for their mirrored sides."""
         self.mirrored = tuple(False for _ in self.mirrored)
 
     def parameters(self) -> dict[str, Tensor]:
@@ -317,7 +317,7 @@ class SceneModel:
         }
 
     def load(self, tensors: Mapping[str, Tensor], counts: tuple[int, ...]) -> None:
-        """Take over parameters as :meth:`parameters` gave them."""
+        """Load parameters returned by :meth:`parameters`."""
         fields = {name: packing.leaf(tensors[name], self.device) for name in packing.FIELDS}
         self.gaussians = Gaussians(**fields, counts=counts)
         self.sky = packing.leaf(tensors["sky"], self.device)
@@ -341,7 +341,7 @@ class SceneModel:
         """Render ``camera``, of the rig at any size, on the recording vehicle at ``t_us``.
 
         Args:
-            degree: of the spherical harmonics; the highest by default.
+            degree: degree of the spherical harmonics; the highest by default.
             mirrored: per object, whether to show its mirrored side.
             depth: whether to render depth.
         """

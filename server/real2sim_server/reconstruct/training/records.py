@@ -31,20 +31,20 @@ KEYS_OF_VERSION_3 = {
     "buried_depth": "occluded_depth",
 }
 PRIORS_OF_VERSION_3 = "guesses."
-"""Version 3 is the same under other names."""
+"""Prefix of the tensors of priors in checkpoints of version 3."""
 
 
 @dataclass(frozen=True, eq=False)
 class Checkpoint:
-    """Everything needed to resume a run without a difference in the result.
+    """Complete state of a run. Resuming from it does not change the result.
 
     Attributes:
         iteration: completed steps.
         counts: Gaussians of the background and of each object.
         prior_counts: the same for priors; empty before they are inserted.
-        optimizer_steps: of the optimiser.
-        options: of training, JSON values.
-        log_name: of the training log.
+        optimizer_steps: steps of the optimiser.
+        options: options of training, JSON values.
+        log_name: name of the training log.
         running: smoothed figures for progress.
         tensors: parameters and moments by name.
     """
@@ -77,7 +77,7 @@ def read_checkpoint(folder: Path) -> Checkpoint:
     """Read a checkpoint of :func:`write_checkpoint`.
 
     Raises:
-        ReconstructError: nothing there, damaged, or of another version.
+        ReconstructError: the checkpoint is missing, damaged, or of another version.
     """
     path = folder / STATE_FILE
     try:
@@ -99,7 +99,7 @@ def read_checkpoint(folder: Path) -> Checkpoint:
 
 
 def _upgraded(values: Any) -> Any:
-    """JSON values of version 3 under the names of VERSION."""
+    """Rename JSON values of version 3 to the names of VERSION."""
     if not isinstance(values, dict):
         return values
     renamed = {KEYS_OF_VERSION_3.get(key, key): _upgraded(v) for key, v in values.items()}
@@ -107,7 +107,7 @@ def _upgraded(values: Any) -> Any:
 
 
 def _with_tilts(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Roll and pitch of boxes that were upright, where a run of a release before had none."""
+    """Zero roll and pitch, for checkpoints of older releases without them."""
     added = {}
     for name, yaws in tensors.items():
         group, _, key = name.rpartition(".")
@@ -188,7 +188,7 @@ OnTraining = Callable[[TrainingProgress], None]
 
 @dataclass
 class RunningMeans:
-    """Smoothed figures and the time spent by stage [s]."""
+    """Smoothed metrics and time by stage [s]."""
 
     loss: float = 0.0
     squared: float = 0.0
@@ -196,7 +196,7 @@ class RunningMeans:
     stages: dict[str, float] = field(default_factory=dict)
 
     def add(self, loss: float, squared: float) -> None:
-        """Take in one step."""
+        """Add one step."""
         self.loss = SMOOTHING * self.loss + (1 - SMOOTHING) * loss
         self.squared = SMOOTHING * self.squared + (1 - SMOOTHING) * squared
         self.weight = SMOOTHING * self.weight + (1 - SMOOTHING)
@@ -233,7 +233,7 @@ class StepTimer:
         self._stages = stages
 
     def __call__(self, name: str) -> StepTimer:
-        """For ``with``: the block's seconds count as those of ``name``."""
+        """Context manager that adds the time of its block to ``name``."""
         self._name = name
         return self
 

@@ -56,12 +56,12 @@ def one_torch_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-# Box noise: added for tests, and smoothed away before initialisation.
+# Box noise: added for tests, and smoothed before initialisation.
 
 ACCELERATION, YAW_ACCELERATION = 2.0, 0.6
 """Motion priors of vehicles: standard deviations [m/s^2] and [rad/s^2]."""
 MIN_NOISE, MIN_YAW_NOISE = 0.02, 0.005
-"""Boxes with less noise do not change [m], [rad]."""
+"""Minimum noise for smoothing boxes [m], [rad]."""
 MIN_POSES = 5
 
 
@@ -90,7 +90,7 @@ def with_box_noise(log: DrivingLog, fraction: float, *, seed: int = 0) -> Drivin
 
 
 def smoothed_boxes(log: DrivingLog) -> DrivingLog:
-    """``log`` without the noise in its boxes that vehicles cannot follow.
+    """``log`` with box noise smoothed to feasible vehicle motion.
 
     The variance of second differences measures the noise. If it exceeds normal driving, positions
     and headings are smoothed with the weight that follows from both (Whittaker 1923). Boxes without
@@ -242,15 +242,14 @@ def train(
 ) -> TrainResult:
     """Train a scene on ``log``.
 
-    Stage 0 does not use the held-out frames either: neither their images nor their sweeps are read
-    before the end.
+    Neither stage 0 nor training reads images or sweeps of the held-out frames.
 
     Args:
-        options: of stage 0 and of training.
-        folder: for the first scene, checkpoints, metrics and preview pictures.
+        options: options of stage 0 and of training.
+        folder: folder of the first scene, checkpoints, metrics and preview pictures.
         resume: continue from the checkpoint in ``folder``. On the CPU the result is bit for bit
             the same as without an interruption.
-        backend: of the renderer.
+        backend: backend of the renderer.
         on_progress: called with the stage, completed and total steps.
         on_training: called with figures every ``options.log_every`` steps.
         timing_s: filled with the seconds of each stage.
@@ -300,7 +299,7 @@ def _first_scene(
     on_progress: OnProgress | None,
     timing_s: dict[str, float],
 ) -> Scene:
-    """The scene of stage 0: made now and written down, or the one a broken-off run began with."""
+    """The scene of stage 0: built and saved now, or loaded from the interrupted run."""
     if resume:
         if not (folder / CHECKPOINT).is_dir():
             raise ReconstructError(f"{folder}: holds no checkpoint to resume; start without resume")

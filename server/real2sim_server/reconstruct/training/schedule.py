@@ -53,17 +53,17 @@ class LearningRates:
     """Adam's learning rates; pairs decay exponentially from the first to the second value.
 
     Attributes:
-        means: [m] per step.
-        scales, quats, opacities: for logarithms, raw quaternions and logits.
-        colour: of the constant part; the rest of the spherical harmonics gets 1/20 of it.
-        fourier: of the time-varying colour.
-        sky: of the cube map.
-        pose_translation: of object boxes [m].
-        pose_yaw: of object boxes [rad].
-        pose_tilt: of their roll and pitch [rad].
-        camera: of camera poses [m, rad]; 0 keeps the calibration.
-        exposure: of each camera's affine colour; 0 disables it.
-        image_exposure: of the gains of each image; 0 keeps them at 1.
+        means: centres [m per step].
+        scales, quats, opacities: log scales, raw quaternions and logits.
+        colour: constant part; the rest of the spherical harmonics gets 1/20 of it.
+        fourier: time-varying colour.
+        sky: cube map of the sky.
+        pose_translation: positions of object boxes [m].
+        pose_yaw: yaw of object boxes [rad].
+        pose_tilt: roll and pitch of object boxes [rad].
+        camera: camera poses [m, rad]; 0 keeps the calibration.
+        exposure: affine colour of each camera; 0 disables it.
+        image_exposure: gains of each image; 0 keeps them at 1.
 
     Sources: Kerbl et al. 2023; Street Gaussians (poses, sky); drivestudio (cameras).
     """
@@ -89,8 +89,8 @@ class TrainOptions:
 
     Attributes:
         iterations: steps, one image each.
-        seed: for the order of images and all noise.
-        width: of the training images [px]; None for the logged width. Never above ``max_width``.
+        seed: seed of the order of images and of all noise.
+        width: image width [px]; None for the logged width. Never above ``max_width``.
         max_width: largest width of training images [px].
         coarse: (fraction of iterations, divisor of the width) stages before full size.
         scales: divisors of the width to cycle through after these stages; (1, 2, 2) keeps a scene
@@ -103,7 +103,7 @@ class TrainOptions:
         refine_poses: whether to refine object boxes.
         pose_start: fraction of the iterations before which boxes are fixed.
         mirror: fraction of steps that show vehicles mirrored about their long axis.
-        initial_opacity: of Gaussians from LiDAR.
+        initial_opacity: initial opacity of Gaussians from LiDAR.
         sky_resolution: edge length of a face of the sky [px].
         depth_points: maximum number of LiDAR points per step.
         regularise_every: interval of the steps with the costly object terms.
@@ -232,8 +232,8 @@ def at_width(options: TrainOptions, width: int) -> TrainOptions:
     """``options`` for images of ``width`` [px], coarse to fine if they are wider than the preset's.
 
     Earlier stages keep their image widths, so most steps cost the same. In the last stage, one
-    image at full size alternates with two downscaled images; otherwise the scene would be too sharp
-    for smaller images.
+    image at full size alternates with two downscaled images, so that smaller images do not become
+    too sharp.
     """
     part = -(-width // options.max_width)
     if part > 1:
@@ -246,7 +246,7 @@ def preset(name: str, **changes: Any) -> TrainOptions:
     """The preset of that name with some values changed.
 
     Raises:
-        ReconstructError: an unknown name, with those there are.
+        ReconstructError: the name is unknown; the message lists the presets.
     """
     if name not in PRESETS:
         raise ReconstructError(f"preset must be one of {list(PRESETS)}, not {name!r}")
@@ -254,7 +254,7 @@ def preset(name: str, **changes: Any) -> TrainOptions:
 
 
 def exponential_decay(span: tuple[float, float], fraction: float) -> float:
-    """Interpolate between the values of ``span`` as ``fraction`` goes from 0 to 1."""
+    """Interpolate between the values of ``span`` for ``fraction`` from 0 to 1."""
     first, last = span
     return float(first * (last / first) ** min(max(fraction, 0.0), 1.0)) if first > 0 else 0.0
 
@@ -294,7 +294,7 @@ def from_values(kind: type, values: dict[str, Any]) -> Any:
     for item in fields(kind):
         default = getattr(kind(), item.name)
         if item.name not in values:
-            # Absent in runs of earlier releases.
+            # Missing in runs of earlier releases.
             continue
         value = values[item.name]
         if is_dataclass(default):

@@ -1,4 +1,4 @@
-"""The training loop: one image a step."""
+"""The training loop, with one image per step."""
 
 from __future__ import annotations
 
@@ -55,10 +55,10 @@ class Trainer:
 
     Args:
         log: the drive, all frames.
-        scene: of stage 0, built without the held-out frames.
-        options: of training.
-        folder: for checkpoints and metrics; None writes nothing.
-        backend: of the renderer.
+        scene: scene of stage 0, built without the held-out frames.
+        options: options of training.
+        folder: folder of checkpoints and metrics; None writes nothing.
+        backend: backend of the renderer.
     """
 
     def __init__(
@@ -105,7 +105,7 @@ class Trainer:
         on_preview: Callable[[SceneModel, int], None] | None = None,
         until: int | None = None,
     ) -> None:
-        """Take all remaining steps, or those before ``until``.
+        """Run all remaining steps, or those before ``until``.
 
         Raises:
             LogError: an image or sweep cannot be read.
@@ -157,7 +157,7 @@ class Trainer:
         return dict(zip(terms, values, strict=True))
 
     def _flips(self, i: int) -> tuple[bool, ...]:
-        """Which vehicles show their other side in this step."""
+        """Vehicles that are mirrored in this step."""
         vehicles = self.model.mirrored
         if not any(vehicles):
             return ()
@@ -181,7 +181,7 @@ class Trainer:
         if weights.sky > 0 and view.sky is not None:
             terms["sky"] = weights.sky * losses.sky_opacity(output.alpha[0], view.sky)
         if self.iteration % self.options.regularise_every == 0:
-            # Rare but heavy: as much in all as every step with its own weight.
+            # Evaluated rarely, with the weight scaled by the interval.
             for name, term in self._regularisers(view).items():
                 terms[name] = term * self.options.regularise_every
         if weights.opacity > 0:
@@ -221,7 +221,7 @@ class Trainer:
 
     @torch.no_grad()
     def _update(self, rendered: RenderedView) -> TrainingStep:
-        """Move every parameter along its gradient, those that were visible."""
+        """Update the parameters of visible Gaussians along their gradients."""
         gaussians, parameters = self.model.gaussians, self.model.parameters()
         rows = self._rows(rendered.drawn)
         assert rendered.output.screen is not None
@@ -245,10 +245,10 @@ class Trainer:
         fraction = self.iteration / self.options.iterations
         rates = learning_rates_at(self.options, fraction, functions=int(gaussians.sh.shape[1]))
         self.optimizer.step(parameters, rates, masks)
-        # A colour outside the gamut would compensate for a Gaussian in front of it, and show once
-        # that Gaussian is gone.
+        # A colour outside the gamut would compensate for a Gaussian in front of it, and become
+        # visible without that Gaussian.
         gaussians.sh[:, 0].clamp_(*CONSTANT_SH)
-        # A sky beyond white could be trained, but neither written nor seen.
+        # Sky colours beyond white cannot be stored.
         self.model.sky.clamp_(0, 1)
         for parameter in parameters.values():
             parameter.grad = None
@@ -259,7 +259,7 @@ class Trainer:
         return [slice(starts[k], starts[k + 1]) for k in drawn]
 
     def _densify(self, step: TrainingStep) -> None:
-        """Add, remove and reset Gaussians where it is time to."""
+        """Add, remove and reset Gaussians if a round is due."""
         model, strategy, optimizer = self.model, self.strategy, self.optimizer
         model.gaussians = strategy.step_post_backward(model.gaussians, optimizer, step)
         if self.occlusion_pruning.step(model, optimizer, step.iteration):
@@ -325,7 +325,7 @@ class Trainer:
         """Restore the last checkpoint in the folder.
 
         Raises:
-            ReconstructError: there is none, or it belongs to another log or other options.
+            ReconstructError: the checkpoint is missing, or belongs to another log or other options.
         """
         if self.folder is None:
             raise ReconstructError("a run without a folder leaves no checkpoint to resume")
@@ -360,7 +360,7 @@ class Trainer:
 
 
 def _on_host(*values: Tensor) -> list[float]:
-    """All values in one copy, so that a step waits for its device once."""
+    """All values in one copy, so that a step synchronises with its device only once."""
     numbers: list[float] = torch.stack([v.detach().double() for v in values]).tolist()
     return numbers
 

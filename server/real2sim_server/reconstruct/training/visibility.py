@@ -34,7 +34,7 @@ FAINT_LOGIT = -3.0
 """Logit of an opacity that occludes almost nothing but is well above the blending cutoff."""
 PRIOR_FRACTION = 0.01
 """Priors are inserted up to this visible fraction behind the trained scene. A higher value degrades
-the logged views, a lower one leaves holes in sides that only a turned object shows.
+the logged views, a lower one leaves holes in sides that become visible when an object turns.
 """
 SKY_FRACTION = 0.1
 """A texel of the sky counts as hidden up to this visible fraction."""
@@ -220,7 +220,7 @@ def prune_hidden(
     """Remove Gaussians that are almost invisible, or barely visible and deep behind the surface.
 
     Args:
-        besides: [N] bool, further Gaussians to remove.
+        besides: [N] bool, additional Gaussians to remove.
     """
     hidden = torch.where(
         gaussians.owners > 0, seen.hidden(object_limits), seen.hidden(background_limits)
@@ -243,7 +243,7 @@ def behind_objects(model: SceneModel, seen: GaussianVisibility, limits: Visibili
 
 
 def hardly_seen(model: SceneModel, seen: GaussianVisibility, offered: OfferedPriors) -> Tensor:
-    """[1 + objects] bool: objects with a body on offer that images barely show.
+    """[1 + objects] bool: objects with an available body that images barely show.
 
     A few pixels are too little evidence to learn a vehicle.
     """
@@ -264,10 +264,10 @@ def hardly_seen(model: SceneModel, seen: GaussianVisibility, offered: OfferedPri
 
 @dataclass(frozen=True, eq=False)
 class OfferedPriors:
-    """Priors that can fill places that no image shows.
+    """Priors for regions that no image shows.
 
     Attributes:
-        scene: from stage 0, or with other clouds for its objects.
+        scene: scene of stage 0, or with other clouds for its objects.
         alternatives: [N] int64 per Gaussian of ``scene``: of the Gaussians with the same number,
             only the first that fits is inserted. A negative number marks a Gaussian without
             alternatives. None: no Gaussian has alternatives.
@@ -301,7 +301,7 @@ def occluded_priors(
         viewpoints: training views.
         limit: a background Gaussian counts as hidden in stage 0 up to this visible fraction.
         wanted: [N] bool, Gaussians of ``first`` to insert even where they are visible.
-        alternatives: of the Gaussians of ``first``, see :class:`OfferedPriors`.
+        alternatives: numbers of the Gaussians of ``first``, see :class:`OfferedPriors`.
         bare: [N] bool, Gaussians of ``first`` that count as hidden in stage 0.
     """
     hidden = visibility(first, viewpoints).fractions <= limit
@@ -309,7 +309,7 @@ def occluded_priors(
         hidden |= bare
     offered = (hidden | (first.gaussians.owners > 0)).nonzero()[:, 0]
     priors, trained = first.gaussians.select(offered), model.gaussians
-    # Faint, so that no prior occludes another: several can be behind one gap in the surface.
+    # Almost transparent, so that priors behind the same gap do not occlude each other.
     faint = replace(priors, logits=torch.full_like(priors.logits, FAINT_LOGIT))
     model.gaussians, is_prior = concatenate(trained, faint)
     behind = visibility(model, viewpoints).fractions[is_prior] <= PRIOR_FRACTION
@@ -349,7 +349,7 @@ def bare_ground(model: SceneModel, first: SceneModel, seen: GaussianVisibility) 
 
 
 def _first_of_each(numbers: Tensor) -> Tensor:
-    """[N] bool: negative, or the first of its number."""
+    """[N] bool: numbers that are negative or the first of their value."""
     _, first = np.unique(numbers.cpu().numpy(), return_index=True)
     is_first = torch.zeros(len(numbers), dtype=torch.bool, device=numbers.device)
     is_first[torch.from_numpy(first).to(numbers.device)] = True
@@ -361,7 +361,7 @@ class OcclusionPruning:
 
     Args:
         options: schedule of the rounds and limits for hidden Gaussians.
-        iterations: of the whole training.
+        iterations: iterations of the whole training.
         sample: returns the given number of random training views.
         unseen: returns the Gaussians of a model on sides that no view shows, see
             :func:`unseen_sides`; None: no such sides.
@@ -436,7 +436,7 @@ class OcclusionPruning:
         offered: OfferedPriors,
         seen: GaussianVisibility,
     ) -> None:
-        """Those offered, as opaque as they were, for hidden places, and stage 0's sky likewise."""
+        """The offered priors for hidden places, with their opacity, and the sky of stage 0."""
         opaque = replace(model.options, initial_opacity=0.99, refine_poses=False)
         times = np.array([model.scene.start_us, model.scene.end_us])
         first = SceneModel(offered.scene, opaque, times, backend=model.backend)
@@ -554,7 +554,7 @@ def unseen_sides(
     turns.
 
     Args:
-        bodies: of the objects; None where the body is unknown.
+        bodies: bodies of the objects; None where unknown.
     """
     normals, known = _body_normals(model, bodies)
     facing = viewing_directions(model, viewpoints, normals=normals, objects_only=True).facing
@@ -582,11 +582,11 @@ def _body_normals(model: SceneModel, bodies: Sequence[VehicleBody | None]) -> tu
 def paint_unseen_sides(
     model: SceneModel, viewpoints: Sequence[Viewpoint], bodies: Sequence[VehicleBody | None]
 ) -> None:
-    """Give sides of vehicles that images show only edge on the frontal colours of stage 0.
+    """Give sides of vehicles that images show only edge-on the frontal colours of stage 0.
 
-    The colour of such a Gaussian changes linearly from its learnt value, in the mean direction of
-    the images, to the initial colour at its position, against the normal. The colour visible in the
-    images stays.
+    The colour of each of these Gaussians changes linearly from its learnt value, in the mean
+    direction of the images, to the initial colour at its position, against the normal. The colour
+    visible in the images stays.
     """
     normals, known = _body_normals(model, bodies)
     seen = viewing_directions(model, viewpoints, normals=normals, objects_only=True)
@@ -609,7 +609,7 @@ def paint_unseen_sides(
 
 
 def _initial_colours(model: SceneModel, rows: Tensor) -> Tensor:
-    """Colours [M, 3] that stage 0 has where the Gaussians ``rows`` [M] of objects are."""
+    """Colours [M, 3] of stage 0 at the positions of the object Gaussians ``rows`` [M]."""
     from scipy.spatial import cKDTree
 
     starts = model.gaussians.starts
@@ -643,7 +643,7 @@ def plain_lobes(model: SceneModel, seen: ViewingDirections, *, prior: float = LO
     covariance = seen.seconds[objects] - means[:, :, None] * means[:, None]
     eye = torch.eye(3, device=sh.device)
     kept = torch.linalg.solve(covariance + prior * eye, covariance)
-    # Lobes lie in the order y, z, x.
+    # The order of the lobes is y, z, x.
     signs = sh.new_tensor([-1.0, -1.0, 1.0])[:, None]
     slopes = sh[:, 1:4].roll(1, dims=1) * signs * SH_C1
     less = kept @ slopes

@@ -117,7 +117,7 @@ class CpuBackend:
 
     @contextmanager
     def _work_space(self) -> Iterator[Workspace]:
-        """Work space for exclusive use in the block, even if another request interrupts it."""
+        """Context with exclusive work space, even if another request interrupts it."""
         with self._lock:
             space = self._idle_spaces.pop() if self._idle_spaces else Workspace()
             try:
@@ -129,7 +129,7 @@ class CpuBackend:
 def _output(
     request: RasterRequest, images: Sequence[NDArray[Any]], timing: dict[str, float]
 ) -> RenderOutput:
-    """RenderOutput of the requested images, from RGB, alpha, depth, instance and median depth."""
+    """RenderOutput with the requested images of RGB, alpha, depth, instance and median depth."""
     options = request.options
     rgb, alpha, depth, instance, median = map(torch.from_numpy, images)
     return RenderOutput(

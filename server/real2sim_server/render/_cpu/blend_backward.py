@@ -3,12 +3,13 @@
 The backward pass traverses the Gaussians front to back and repeats the forward arithmetic bit for
 bit, so it stops at the same Gaussians without stored state. Let v be colour, depth and 1 weighted
 by the loss gradient of a pixel. The pixel's share of the loss is the sum of w v over its Gaussians.
-``REST`` is the remaining part of this sum; the gradient by alpha is T v - REST / (1 - alpha).
+``REST`` is the remaining part of this sum. The gradient with respect to alpha is
+T v - REST / (1 - alpha).
 
-The inner loop is explicit vector code for one record over one tile. It accumulates gradients by the
-exponent as moments about the centre of the tile, per lane over the rows, and sums the lanes at the
-end. Each entry of a tile list has its own output slot, so results are bitwise independent of the
-number of threads.
+The inner loop is explicit vector code for one record over one tile. It accumulates gradients with
+respect to the exponent as moments about the centre of the tile, per lane over the rows, and sums
+the lanes at the end. Each entry of a tile list has a separate output slot, so results are bitwise
+independent of the number of threads.
 """
 
 # Kernels take arrays by position: Numba supports neither dataclasses nor keyword-only arguments.
@@ -59,7 +60,7 @@ from .records import (
 
 LEFT, REST, BY_RED, BY_GREEN, BY_BLUE, BY_DEPTH, BY_ALPHA = range(7)
 """Planes of eight pixels: transmittance (negative once finished), the remaining sum of w v, and the
-loss gradients by the sums of w times red, green, blue, depth and 1."""
+loss gradients with respect to the sums of w times red, green, blue, depth and 1."""
 BACKWARD_PLANES = 7
 
 SUM_1, SUM_X, SUM_XX, SUM_Y, SUM_XY, SUM_YY, ABS_X, ABS_Y = range(8)
@@ -69,7 +70,7 @@ The last two are sums of its absolute value times |dx'| and |sharpness^2 slope d
 where dx' = dx - slope dy.
 """
 SUM_RED, SUM_GREEN, SUM_BLUE, SUM_DEPTH = range(8, 12)
-"""Loss gradients by the record's colour and depth."""
+"""Loss gradients with respect to the record's colour and depth."""
 SUMS = 16
 
 I64 = ir.IntType(64)
@@ -327,7 +328,7 @@ to the record's centre."""
 
 
 class Losses(NamedTuple):
-    """Loss gradients by the images of one camera; [0, 0] (rgb: [0, 0, 0]) if absent."""
+    """Loss gradients of the images of one camera; [0, 0] (rgb: [0, 0, 0]) if absent."""
 
     rgb: NDArray[np.float32]
     alpha: NDArray[np.float32]

@@ -1,8 +1,8 @@
 """Levels of detail of a cloud: merged Gaussians for small images, built once and cached.
 
 Space is divided into cells along a Z curve, so cells of every size are contiguous ranges of one
-order. Each block of cells selects its level independently. Level 0 is the cloud itself, without a
-copy. A Gaussian larger than the cells of a level is not merged there.
+order. Each block of cells selects its level independently. Level 0 is the original cloud, without a
+copy. A Gaussian larger than the cells of a level is not merged on that level.
 
 The Gaussians of a cell merge into one with the same moments. Each has the weight ``tau area``,
 where tau = -ln(1 - opacity) is its optical depth and ``area`` its cross section averaged over all

@@ -1,8 +1,8 @@
 """One pinhole camera on the CPU: visible chunks, kernel inputs, and drawing in pieces.
 
-Neighbours in memory are mostly neighbours in space, so whole chunks of CHUNK Gaussians are behind a
-camera or outside its image. Bounding boxes of their centres are computed once per cloud. Culling
-skips only Gaussians that the projection would drop, so images are bitwise unchanged.
+Neighbours in memory are mostly neighbours in space, so whole chunks of CHUNK Gaussians are often
+behind a camera or outside its image. Bounding boxes of their centres are computed once per cloud.
+Culling only skips Gaussians that the projection would drop, so images are bitwise unchanged.
 """
 
 from __future__ import annotations

@@ -289,7 +289,7 @@ class TrainingPasses:
     def backward(
         self, training: TrainingPass, images: tuple[Tensor, ...], losses: tuple[Tensor | None, ...]
     ) -> BackwardResult:
-        """Gradients by placements, sky and clouds, from the gradients by RGB, alpha and depth."""
+        """Gradients of placements, sky and clouds, from the gradients of RGB, alpha and depth."""
         result = BackwardResult(training.request)
         with self.lock:
             for camera in range(training.request.cameras):
@@ -412,7 +412,7 @@ class _BackwardPass:
             self._through_projection(slots, result)
 
     def _through_sky(self, result: BackwardResult) -> NDArray[np.float32]:
-        """Return the colour behind the image, and add the gradient by the sky faces."""
+        """Return the colour behind the image, and add the gradient of the sky faces."""
         request = self.training.request
         if request.sky is None or not self.losses.rgb.shape[0]:
             return constant_behind(request)[None, None]

@@ -615,7 +615,7 @@ class LabelDrawing(Drawing):
         )
 
     def _shapes(self, placement: Placement, chunks: Sequence[Chunks]) -> NDArray[np.float32]:
-        """Shapes [M, SHAPE] of the records that are a front; other rows are undefined."""
+        """Shapes [M, SHAPE] of the records that are fronts; other rows are undefined."""
         walk, request = self.walk, self.request
         assert walk.records is not None
         assert walk.fronts is not None

@@ -251,10 +251,10 @@ def mask_of(builder: ir.IRBuilder, bits: Any) -> Any:
 # Kernel options; ``_numba`` caches kernels on disk.
 
 kernel: Any = functools.partial(cached_kernel, nogil=True)
-"""For entry points. They release the GIL."""
+"""Options for entry points, which release the GIL."""
 
 inlined: Any = functools.partial(func, forceinline=True, _nrt=False)
-"""For functions called once per Gaussian; they must not allocate.
+"""Options for functions called once per Gaussian, which must not allocate.
 
 Without ``_nrt=False``, Numba counts references of each array that is passed or sliced with atomic
 instructions, which take several times as long as the work itself.

@@ -3,7 +3,7 @@
 One fused pass over the records of a cluster sums the slots, applies the chain rule through
 projection and spherical harmonics, and writes the gradients. Intermediate numbers are float64,
 because covariances of needles cancel. Each chunk sums the gradients of the placement separately, so
-the order is fixed for any number of threads.
+the summation order does not depend on the number of threads.
 """
 
 # Kernels take arrays by position: Numba supports neither dataclasses nor keyword-only arguments.
@@ -48,13 +48,13 @@ C33, C34 = F32(0.3731763325901154), F32(1.445305721320277)
 
 @inlined(fastmath=FASTMATH)
 def color_backward(cluster, i, r, g, b, out):
-    """Add the gradients by the coefficients of Gaussian ``i`` to ``out`` [K, 3].
+    """Add the gradients of the coefficients of Gaussian ``i`` to ``out`` [K, 3].
 
     Args:
-        r, g, b: loss gradient by the colour before the offset.
+        r, g, b: loss gradient with respect to the colour before the offset.
 
     Returns:
-        Gradient by ``scale * mean - camera_position``, three numbers.
+        Gradient with respect to ``scale * mean - camera_position``, three numbers.
     """
     bands = cluster.sh.shape[1]
     add_coefficient(out, 0, C0, r, g, b)
@@ -83,7 +83,7 @@ def color_backward(cluster, i, r, g, b, out):
 
 @inlined(fastmath=FASTMATH)
 def square_backward(sh, x, y, z, r, g, b, out):
-    """Add the gradients by the coefficients of degree 2: 4 to 8."""
+    """Add the gradients of the coefficients of degree 2: 4 to 8."""
     add_coefficient(out, 4, C2 * x * y, r, g, b)
     add_coefficient(out, 5, -C2 * y * z, r, g, b)
     add_coefficient(out, 6, C20 * z * z - C21, r, g, b)
@@ -100,7 +100,7 @@ def square_backward(sh, x, y, z, r, g, b, out):
 
 @inlined(fastmath=FASTMATH)
 def cubic_backward(sh, x, y, z, r, g, b, out):
-    """Add the gradients by the coefficients of degree 3: 9 to 15."""
+    """Add the gradients of the coefficients of degree 3: 9 to 15."""
     xx, yy, zz = x * x, y * y, z * z
     add_coefficient(out, 9, C30 * y * (THREE * xx - yy), r, g, b)
     add_coefficient(out, 10, C31 * x * y * z, r, g, b)
@@ -127,7 +127,7 @@ def cubic_backward(sh, x, y, z, r, g, b, out):
 
 @inlined(fastmath=FASTMATH)
 def add_coefficient(out, k, basis, r, g, b):
-    """Add the gradient by coefficient ``k``."""
+    """Add the gradient of coefficient ``k``."""
     out[k, 0] += basis * r
     out[k, 1] += basis * g
     out[k, 2] += basis * b
@@ -135,7 +135,7 @@ def add_coefficient(out, k, basis, r, g, b):
 
 @inlined(fastmath=FASTMATH)
 def weigh(sh, k, r, g, b):
-    """Gradient by the value of basis function ``k``."""
+    """Gradient with respect to the value of basis function ``k``."""
     return sh[k, 0] * r + sh[k, 1] * g + sh[k, 2] * b
 
 
@@ -149,7 +149,7 @@ UNIT = EXPONENT_UNIT
 
 
 class Gradients(NamedTuple):
-    """Accumulated loss gradients by the arrays of one cluster.
+    """Accumulated loss gradients with respect to the arrays of one cluster.
 
     If the cluster has covariances, ``covars`` replaces ``quats`` and ``scales``; else it is
     [0, 3, 3].
@@ -182,7 +182,7 @@ def project_backward(cluster, view, base, records, slots, screen_scale, out, pla
     Args:
         cluster, view, base, records: arguments and result of project_cluster.
         slots: SlotSums.
-        screen_scale: factors on the gradients by x and y [px] in ``out.screen``.
+        screen_scale: factors on the gradients of x and y [px] in ``out.screen``.
         out: Gradients.
         placement: [chunks, PLACEMENT] float64, written.
     """
@@ -285,13 +285,13 @@ def gaussian_backward(cluster, view, i, record, total, screen_scale, out, placem
 
 @inlined(fastmath=FASTMATH)
 def shape_backward(cluster, view, i, a, b, total, screen_scale, out):
-    """Add the gradients by opacity, scales and rotation of one record.
+    """Add the gradients of opacity, scales and rotation of one record.
 
     Args:
         a, b: rows of the map from the cluster frame to the image.
 
     Returns:
-        Gradients by the centre on the image (x, y), by ``a`` and by ``b``.
+        Gradients with respect to the centre on the image (x, y), ``a`` and ``b``.
     """
     if cluster.covars.shape[0] > 0:
         covar = cluster.covars[i]
@@ -337,14 +337,14 @@ def shape_backward(cluster, view, i, a, b, total, screen_scale, out):
 
 @inlined(fastmath=FASTMATH)
 def conic_backward(cluster, view, i, xx, xy, yy, sharp, total, screen_scale, out):
-    """Gradients by the opacity of one record and its covariance before blur.
+    """Gradients with respect to the opacity of one record and its covariance before blur.
 
     Args:
         xx, xy, yy, sharp: covariance on the image [px^2] and its determinant before blur.
 
     Returns:
-        Gradients by xx, xy, yy and the determinant, treated as four independent variables, and by
-        the centre on the image (x, y).
+        Gradients with respect to xx, xy, yy and the determinant, as four independent variables,
+        and to the centre on the image (x, y).
     """
     eps = F64(view.eps2d)
     determinant = sharp + eps * (xx + yy) + eps * eps
@@ -399,9 +399,9 @@ def rotation_of(quat):
 
 @inlined(fastmath=FASTMATH)
 def quaternion_backward(quat, norm, a, b, by_p, by_q, out):
-    """Add the gradient by a quaternion with length ``norm``.
+    """Add the gradient of a quaternion with length ``norm``.
 
-    The gradient by the rotation is ``a by_p^T + b by_q^T``.
+    The gradient of the rotation is ``a by_p^T + b by_q^T``.
     """
     inverse = 1.0 / norm
     w, x, y, z = (

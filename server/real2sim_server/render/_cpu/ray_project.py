@@ -57,7 +57,7 @@ from .records import (
 )
 
 called = functools.partial(func, _nrt=False)
-"""For functions that the compiler may inline or call: the work outweighs a call."""
+"""Options for functions that the compiler may inline or call: the work outweighs a call."""
 F32 = np.float32
 OUTLINE = 24
 """Number of points on the outline of a large Gaussian."""

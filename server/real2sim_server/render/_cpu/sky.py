@@ -207,12 +207,12 @@ def sample_sky(faces, matrix, behind, rows, places):
 
 @kernel(parallel=PARALLEL_LOOPS)
 def sky_backward(rows, places, alpha, by_rgb, gradient):
-    """Add the gradients of one camera's image by the faces.
+    """Add the gradients with respect to the faces from one camera's image.
 
     Args:
         rows, places: from sample_sky.
         alpha: [H, W] float32.
-        by_rgb: [H, W, 3] float32, loss gradients by the image.
+        by_rgb: [H, W, 3] float32, loss gradients with respect to the image.
         gradient: [6, R, R, 3] float32, added to.
     """
     height, width = alpha.shape

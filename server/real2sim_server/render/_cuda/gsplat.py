@@ -35,7 +35,7 @@ from .needs import kernels_for_device
 
 @dataclass(frozen=True, eq=False)
 class GsplatStatistics(ScreenStatistics):
-    """Keeps gsplat's centres alive, whose attribute ``absgrad`` has the absolute gradients."""
+    """Keeps gsplat's centres alive; their attribute ``absgrad`` has the absolute gradients."""
 
     means2d: Tensor | None = None
 

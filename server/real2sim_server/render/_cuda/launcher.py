@@ -327,7 +327,7 @@ class CudaLauncher:
         try:
             launch(self._stream(), config, self._kernels[kernel], frame, np.uint32(argument))
         except Exception as error:
-            # Worded like torch's errors, by which a worker detects that its device is lost.
+            # Worded like torch's errors, from which a worker detects a lost device.
             raise RuntimeError(f"CUDA error at the launch of {kernel}: {error}") from error
 
     def pointer(self, tensor: Tensor) -> int:

@@ -126,7 +126,7 @@ def _grow_echo(
 
 
 def close_echo(state: Planes, ends: Any) -> None:
-    """Close the echoes of the rays in ``ends``; record those that are strong enough as returns."""
+    """Close the echoes of the rays in ``ends``; record strong enough echoes as returns."""
     builder = state.builder
     power = state.load(ECHO + 1)
     is_return = builder.and_(ends, power.compare(">=", ECHO_MIN))

@@ -358,7 +358,7 @@ def transforms_at(trajectory: Trajectory, times_us: Float) -> Float:
 
 def kernels_of_casting_on_disk() -> bool:
     """Whether the disk cache has the kernels of :func:`warm_up_casting`."""
-    from .blend import follow_rays  # Imported only where it is needed.
+    from .blend import follow_rays  # Imported lazily, because it is rarely needed.
 
     return is_on_disk(follow_rays)
 

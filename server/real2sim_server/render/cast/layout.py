@@ -266,7 +266,7 @@ def _staring(beams: Beams) -> tuple[NDArray[np.int32], float, float, float]:
 
 
 def _turning_table(beams: Beams) -> tuple[NDArray[np.int32], float, float, float]:
-    """Values of a ray table, which may be that of a spinning sensor (recorded sweeps)."""
+    """Values of a ray table, possibly of a spinning sensor (recorded sweeps)."""
     times, slots = beams.slots
     duration = float(times[-1] - times[0])
     bins, when = _azimuth_bins(wrapped(beams.azimuth)), times[slots]

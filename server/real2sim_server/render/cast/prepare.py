@@ -1,4 +1,4 @@
-"""From the Gaussians of one body to records, with the range of angles at which rays may hit them.
+"""Records of the Gaussians of one body, with the range of angles at which rays may hit them.
 
 The sensor moves while it spins, so the time at which it scans each Gaussian is computed first. At
 the azimuth where the sweep starts and ends, Gaussians are scanned twice, one turn apart, and become

@@ -1,7 +1,7 @@
 """OpenSCENARIO XML, import and export.
 
-``read`` turns a file with its catalogs into a storyboard, by ``read_actions``, ``read_conditions``
-and ``read_positions``; ``elements`` rejects everything that none of them has read.
+``read`` converts a file with its catalogs into a storyboard, with the readers in ``parts``.
+``elements`` rejects all elements that were not read.
 """
 
 from .read import ReadOptions, ScenarioFile, read_openscenario, read_openscenario_text

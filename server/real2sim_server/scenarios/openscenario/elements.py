@@ -19,7 +19,7 @@ from .. import ScenarioError
 MAX_BYTES, MAX_ELEMENTS, MAX_DEPTH = 64 << 20, 1_000_000, 200
 
 WITHOUT_EFFECT = frozenset({"License", "Properties"})
-"""Elements that hold notes of other programs, and no part of the scenario."""
+"""Elements with notes of other programs, which are not part of the scenario."""
 
 _NEEDED = {
     "Event": {"Action"},
@@ -53,7 +53,7 @@ class Scope:
     """Parameters by name, and their replacements in expressions.
 
     Args:
-        texts: by name: ``$name`` of a remaining parameter, a plain text, or ``(expression)``.
+        texts: by name, ``$name`` of a remaining parameter, plain text, or ``(expression)``.
         values: their current values.
     """
 
@@ -70,7 +70,7 @@ class Scope:
         return _NAME.sub(lambda m: _atom(self._text(m.group(1))), text)
 
     def value(self, text: str) -> Any:
-        """A text or expression as it evaluates now."""
+        """The current value of a text or expression."""
         return evaluated(text, self.values)
 
     def _text(self, name: str) -> str:
@@ -111,7 +111,7 @@ class Part:
     # --- attributes -----------------------------------------------------------------------------
 
     def text(self, name: str, default: str | None = None) -> str:
-        """An attribute as it evaluates now."""
+        """The current value of an attribute."""
         given = self._given(name, default)
         value = self._evaluated(name, given)
         if isinstance(value, bool):
@@ -123,7 +123,7 @@ class Part:
         return self.text(name) if name in self.raw.attributes else None
 
     def number(self, name: str, default: float | None = None) -> float | str:
-        """A number, or the expression of parameters that it is."""
+        """A number, or an expression of parameters."""
         given = self._given(name, None if default is None else repr(default))
         value = self._evaluated(name, given)
         try:
@@ -134,11 +134,11 @@ class Part:
         return text if text.startswith("$") and _NAME.search(text) else number
 
     def number_or_none(self, name: str) -> float | str | None:
-        """A number, or None where it is absent."""
+        """A number, or None if it is absent."""
         return self.number(name) if name in self.raw.attributes else None
 
     def magnitude(self, name: str, default: float | None = None) -> float | str:
-        """A time or distance, which is 0 or more; or its parameter expression."""
+        """A non-negative time or distance, or an expression of parameters."""
         found = self.number(name, default)
         value = float(self._evaluated(name, self._given(name, repr(default))))
         if value < 0:
@@ -146,11 +146,11 @@ class Part:
         return found
 
     def magnitude_or_none(self, name: str) -> float | str | None:
-        """A time or distance, or None where it is absent."""
+        """A time or distance, or None if it is absent."""
         return self.magnitude(name) if name in self.raw.attributes else None
 
     def integer(self, name: str, default: int | None = None) -> int:
-        """A whole number as it evaluates now."""
+        """The current value of an integer attribute."""
         value = self._evaluated(name, self._given(name, None if default is None else str(default)))
         try:
             number = float(value)
@@ -161,7 +161,7 @@ class Part:
         return int(number)
 
     def flag(self, name: str, default: bool | None = None) -> bool:
-        """True or false as it evaluates now."""
+        """The current value of a boolean attribute."""
         given = self._given(name, None if default is None else str(default).lower())
         value = str(self._evaluated(name, given)).lower()
         if value not in {"true", "false", "1", "0"}:
@@ -194,19 +194,19 @@ class Part:
     # --- children -------------------------------------------------------------------------------
 
     def children(self, *tags: str) -> list[Part]:
-        """Children with these names in order; without names all."""
+        """Children with these names in order; all without names."""
         found = [c for c in self.raw.children if not tags or c.tag in tags]
         return [self._of(c) for c in found]
 
     def find(self, tag: str) -> Part | None:
-        """The child with a name; None if there is none."""
+        """The child with a name, or None."""
         found = self.children(tag)
         if len(found) > 1:
             raise self.error(f"<{self.tag}> has {len(found)} elements <{tag}>; one is allowed")
         return found[0] if found else None
 
     def child(self, tag: str) -> Part:
-        """The child of a name."""
+        """The child with a name; required."""
         found = self.find(tag)
         if found is None:
             raise self.error(f"<{self.tag}> lacks <{tag}>")
@@ -325,7 +325,7 @@ class _Builder:
         self._open.pop()
 
     def _doctype(self, *_: Any) -> None:
-        # Entities could blow a small file up to fill the memory, and no scenario needs any.
+        # Entities could expand a small file until it fills the memory; scenarios do not need them.
         raise ScenarioError(f"{self._file}: declares a document type or entities")
 
 
@@ -402,7 +402,7 @@ PEDESTRIANS = {"pedestrian": "pedestrian", "wheelchair": "pedestrian", "animal":
 
 
 def back(words: dict[str, str], word: str) -> str:
-    """The first word of OpenSCENARIO for one of the storyboard."""
+    """The first OpenSCENARIO word for a word of the storyboard."""
     return next(theirs for theirs, ours in words.items() if ours == word)
 
 
@@ -413,7 +413,7 @@ KINDS = {name: name for name in (*NUMBERS, "string", "boolean", "dateTime")}
 
 
 def scoped(part: Part) -> Part:
-    """An element in the scope of the parameters that it declares for itself: inner names win."""
+    """An element in the scope of its parameter declarations; inner names take precedence."""
     declarations = part.find("ParameterDeclarations")
     return part if declarations is None else part.within(declared(declarations, {}, {}))
 
@@ -514,5 +514,5 @@ def _holds(value: Any, rule: str, text: str) -> bool:
 
 
 def _embedded(text: str) -> str:
-    """An expression as a part of others."""
+    """An expression as part of another one."""
     return f"({text[2:-1]})" if text.startswith("${") else text

@@ -26,7 +26,7 @@ Fields = dict[str, Any]
 """Fields of a storyboard model."""
 
 Resolve = Callable[[Part, str], Part]
-"""The entry of a catalog that an element refers to, of a type."""
+"""The catalog entry of a type that an element refers to."""
 
 
 class Positions:
@@ -36,13 +36,13 @@ class Positions:
         self._entry = entry
 
     def position(self, part: Part) -> Fields:
-        """The position that an element holds."""
+        """The position in an element."""
         found = part.only(_POSITIONS)
         fields: Fields = _POSITIONS[found.tag](self, found)
         return fields
 
     def route(self, part: Part) -> Fields:
-        """Fields of ``RouteRef`` or ``AssignRouteAction``: an inline route, or one of a catalog."""
+        """Fields of ``RouteRef`` or ``AssignRouteAction``: an inline route, or a catalog entry."""
         found = part.only({"Route", "CatalogReference"})
         is_named = found.tag == "CatalogReference"
         found = self._entry(found, "Route") if is_named else scoped(found)
@@ -232,18 +232,18 @@ _SHAPES: dict[str, Callable[[Positions, Part], Fields]] = {
 
 
 def signal_state(part: Part) -> Fields:
-    """The state of one traffic signal, as an action sets it and a condition expects it."""
+    """The state of a traffic signal, set by an action or expected by a condition."""
     return {"kind": "signal_state", "signal": part.text("name"), "state": part.text("state")}
 
 
 def signal_phase(part: Part) -> Fields:
-    """The phase of a signal controller, as an action sets it and a condition expects it."""
+    """The phase of a signal controller, set by an action or expected by a condition."""
     controller = part.text("trafficSignalControllerRef")
     return {"kind": "signal_phase", "controller": controller, "phase": part.text("phase")}
 
 
 def plain_value(text: str) -> bool | float | str:
-    """A text as the value that it looks like."""
+    """A text converted to a boolean or number if possible."""
     if text in {"true", "false"}:
         return text == "true"
     try:
@@ -259,7 +259,7 @@ class Conditions:
         self._positions = positions
 
     def trigger(self, part: Part | None) -> Fields | None:
-        """A trigger; None if there is none."""
+        """A trigger, or None."""
         if part is None:
             return None
         groups = []
@@ -433,7 +433,7 @@ _BY_ENTITY: dict[str, Any] = {
 # --- Actions --------------------------------------------------------------------------------------
 
 MODES = {"position": "position", "follow": "follow"}
-"""Trajectories and dynamics are followed exactly in both: 'follow' only allows to deviate."""
+"""Both modes are followed exactly: 'follow' permits deviations but does not require them."""
 
 
 class Actions:
@@ -443,7 +443,7 @@ class Actions:
         self._positions = positions
 
     def action(self, part: Part) -> list[Fields]:
-        """What ``Action`` of an event, ``PrivateAction`` or ``GlobalAction`` does."""
+        """The action of an event's ``Action``, of ``PrivateAction`` or ``GlobalAction``."""
         found = part.only(None)
         while found.tag in _NESTED:
             found = found.only(None)
@@ -537,7 +537,7 @@ class Actions:
             "limits": _limits(part),
         }
 
-    # --- both -----------------------------------------------------------------------------------
+    # --- longitudinal and lateral ---------------------------------------------------------------
 
     def _synchronize(self, part: Part) -> Fields:
         fields: Fields = {
@@ -613,7 +613,7 @@ class Actions:
         part.optional("controllerRef")
         return {"kind": "controller", "active": part.flag("longitudinal", False)}
 
-    # --- of nobody ------------------------------------------------------------------------------
+    # --- global ---------------------------------------------------------------------------------
 
     def _entity(self, part: Part) -> Fields:
         entity = part.text("entityRef")
@@ -665,7 +665,7 @@ def _limits(part: Part) -> Fields:
 
 
 def _inline(part: Part) -> Part:
-    """A trajectory of version 1.0, which stands in the action itself."""
+    """A trajectory of version 1.0, defined directly in the action."""
     kept = [c for c in part.raw.children if c.tag in {"Trajectory", "CatalogReference"}]
     holder = type(part.raw)(part.tag, part.raw.line, {}, kept)
     return Part(holder, part.file, part.scope)

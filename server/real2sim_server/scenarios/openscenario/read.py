@@ -45,10 +45,10 @@ MAX_FILES = 1000
 
 
 class Catalogs:
-    """Entries by catalog and name, of the folders that a scenario names.
+    """Catalog entries by catalog and name, from the folders named in a scenario.
 
     Args:
-        folder: of the scenario; nothing outside of the folders that it names is read.
+        folder: folder of the scenario. Files outside the named folders are not read.
         leave_out: see :func:`.elements.read_elements`.
     """
 
@@ -282,7 +282,7 @@ def read_openscenario(path: Path, options: ReadOptions | None = None) -> Scenari
 def read_openscenario_text(
     data: bytes, name: str, options: ReadOptions | None = None
 ) -> ScenarioFile:
-    """The same of a content that has no folder, and so no catalogs. Raises ScenarioError."""
+    """The storyboard of a file's content, without a folder or catalogs. Raises ScenarioError."""
     options = options or ReadOptions()
     return _read(read_elements(data, name, options.leave_out), name, None, options)
 

@@ -139,12 +139,12 @@ def load_scene(
 
     Args:
         path: folder of the bundle.
-        device: of the tensors.
+        device: device of the tensors.
         verify: check every hash and every value; without it only shapes, types and file
             sizes are checked.
 
     Raises:
-        BundleError: with the file and the reason: missing, cut short, changed, of another version.
+        BundleError: names the file and the reason: missing, truncated, changed, of another version.
     """
     folder = Path(path)
     document = read_container(folder, SceneDocument, verify=verify)
@@ -171,14 +171,14 @@ def load_scene(
 
 
 def load_ground(path: str | PathLike[str], content_hash: str) -> Ground:
-    """The ground of a scene bundle, without its scene. Shared with the loaded scene.
+    """The ground of a scene bundle, without the rest of the scene. Shared with the loaded scene.
 
     Args:
         path: folder of the bundle.
-        content_hash: that the bundle must have.
+        content_hash: expected hash of the bundle.
 
     Raises:
-        BundleError: as :func:`load_scene`, or it is another bundle by now.
+        BundleError: as :func:`load_scene`, or the hash has changed.
     """
     folder = Path(path)
     document = _document_of(folder, content_hash)
@@ -187,7 +187,7 @@ def load_ground(path: str | PathLike[str], content_hash: str) -> Ground:
 
 
 def load_lanes(path: str | PathLike[str], content_hash: str) -> LaneGraph | None:
-    """The lanes of a scene bundle, without its scene; None if it has none.
+    """The lanes of a scene bundle, without the rest of the scene; None without lanes.
 
     Args:
         path: folder of the bundle.
@@ -396,7 +396,7 @@ def _bounds(means: Tensor) -> Bounds | None:
 
 
 def _open(folder: Path, name: str, sizes: Mapping[str, int], verify: bool) -> TensorFile:
-    # Names come from here, never from scene.json, so no bundle can point outside its folder.
+    # File names are never read from scene.json, so a bundle cannot point outside its folder.
     if name not in sizes:
         raise BundleError(f"{folder}: scene.json does not list {name!r} under 'files'")
     return TensorFile(folder / name, nbytes=sizes[name], verify=verify)
@@ -530,7 +530,7 @@ def _read_ground(folder: Path, document: SceneDocument, *, verify: bool) -> Grou
 
 @contextmanager
 def _as_bundle_error(folder: Path) -> Iterator[None]:
-    """Name the bundle in errors about its content."""
+    """Add the name of the bundle to errors about its content."""
     try:
         yield
     except BundleError:
@@ -555,8 +555,8 @@ class StagingLimits:
 
     Attributes:
         max_bytes: memory of the resulting Gaussians.
-        memory_bytes: of the process that reads, mapped files included.
-        seconds: of one import.
+        memory_bytes: memory of the reading process, including mapped files.
+        seconds: duration of one import.
     """
 
     max_bytes: int
@@ -574,7 +574,7 @@ def stage_scene(source: Path, folder: Path, *, name: str, limits: StagingLimits)
     Raises:
         BundleTooLargeError: it takes more memory than the limits allow.
         BundleError: it cannot be read, or took too long.
-        SceneError: invalid values, or the bundle cannot be written.
+        SceneError: the values are not a valid scene, or the bundle cannot be written.
     """
     _staged("read_and_save_scene", source, folder, limits, {"name": name})
 
@@ -586,11 +586,11 @@ def stage_asset(
 
     Args:
         source: the splat file.
-        folder: of the bundle; its parent exists.
+        folder: folder of the bundle; its parent exists.
         asset_id: name of the asset.
         options: ``category``, ``up_axis`` and ``yaw`` as for :func:`~.splats.import_splats`, and
             ``length`` [m], None for the length in the file.
-        limits: of the import.
+        limits: limits of the import.
 
     Raises:
         BundleTooLargeError, BundleError, SceneError: as :func:`stage_scene`.
@@ -652,7 +652,7 @@ def read_and_save_asset(
         name=asset_id,
         as_asset=True,
         category=category,
-        # Most files without axes come from trainers that look along z.
+        # Most files without axes come from trainers with cameras that look along z.
         up_axis=up_axis or up_axis_of(source) or "-y",
         yaw=yaw,
         max_bytes=max_bytes,

@@ -79,14 +79,14 @@ def tensor_hash(tensor: Tensor) -> str:
 
 
 def tensor_hashes(tensors: Mapping[str, Tensor]) -> dict[str, str]:
-    """:func:`tensor_hash` of each."""
+    """:func:`tensor_hash` of each tensor."""
     return {name: tensor_hash(tensor) for name, tensor in tensors.items()}
 
 
 def write_tensors(tensors: Mapping[str, Tensor], path: Path) -> int:
     """Write a new safetensors file; returns its size in bytes."""
     save_file({name: tensor.numpy() for name, tensor in tensors.items()}, path)
-    # The library makes the file readable only for its owner; a service often runs as another user.
+    # The library makes the file readable only by its owner; a service often runs as another user.
     path.chmod(path.parent.stat().st_mode & 0o666)
     return path.stat().st_size
 
@@ -96,11 +96,11 @@ class TensorFile:
 
     Args:
         path: the file.
-        nbytes: how long it must be.
-        verify: compare the hash of every tensor taken.
+        nbytes: expected length of the file.
+        verify: compare the hash of every tensor that is read.
 
     Raises:
-        BundleError: missing, a link, of another length, or no safetensors file.
+        BundleError: the file is missing, a link, of another length, or not a safetensors file.
     """
 
     def __init__(self, path: Path, *, nbytes: int, verify: bool) -> None:
@@ -127,8 +127,7 @@ class TensorFile:
 
         Raises:
             BundleError: a tensor is missing, has a wrong shape or type or, with verification, a
-                hash
-                other than in ``hashes``.
+                hash that differs from ``hashes``.
         """
         if set(hashes) != set(shapes):
             raise BundleError(
@@ -216,7 +215,7 @@ def read_container(path: Path, model: type[DocumentT], *, verify: bool) -> Docum
     """The document of the bundle at ``path``; with ``verify`` its hash is compared.
 
     Raises:
-        BundleError: no bundle, another version, another kind, or not as the format asks.
+        BundleError: not a bundle, another version, another kind, or not a valid document.
     """
     file = path / DOCUMENT_NAME
     given = _load_json(path, file)
@@ -278,7 +277,7 @@ def _refuse_constant(constant: str) -> float:
 
 
 def _check_head(given: Any, file: Path, kind: str) -> None:
-    """Check format, version and kind first: other versions may differ in everything else."""
+    """Check format, version and kind before anything else, which may differ between versions."""
     if not isinstance(given, dict) or given.get("format") != FORMAT:
         raise BundleError(f"{file}: not of format {FORMAT!r}")
     version = given.get("version")

@@ -106,7 +106,7 @@ class OpticsPart(_Part):
         )
 
     def build(self) -> Optics:
-        """The optics. Raises SceneError for values that lens or shutter refuse."""
+        """The optics. Raises SceneError for values that lens or shutter reject."""
         shutter = GLOBAL if self.shutter is None else Shutter(**self.shutter.model_dump())
         return Optics(np.array(self.K, dtype=np.float64), lens_from(self.lens), shutter)
 
@@ -347,8 +347,8 @@ def lane_document(graph: LaneGraph, *, with_roads: bool = True) -> SceneLanes:
     """The document of a graph.
 
     Args:
-        graph: of a scene.
-        with_roads: also tell the reference lines of roads.
+        graph: graph of a scene.
+        with_roads: include the reference lines of roads.
     """
     tables = [name for name in _TABLES if with_roads or name != "roads"]
     parts = {name: [_values(p) for p in getattr(graph, name).values()] for name in tables}
@@ -391,7 +391,7 @@ def read_lanes(path: Path) -> LaneGraph:
     """The graph in a file ``lanes.json``.
 
     Raises:
-        BundleError: missing, too large, not such a document, or not a graph; names the file.
+        BundleError: missing, too large, not a lane document, or not a valid graph; names the file.
     """
     try:
         if path.stat().st_size > MAX_LANES_BYTES:
@@ -408,7 +408,7 @@ def read_lanes(path: Path) -> LaneGraph:
 
 
 def pack_lanes(graph: LaneGraph) -> tuple[dict[str, Any], dict[str, NDArray[np.float64]]]:
-    """A graph as its document with lengths in the place of arrays, and the arrays: ``points``
+    """A graph as its document with lengths in place of arrays, and the arrays: ``points``
     [P, 3] and ``values`` [V], in the order of the document."""
     arrays: dict[str, list[Any]] = {"points": [], "values": []}
 
@@ -431,7 +431,7 @@ def unpack_lanes(
     """Inverse of :func:`pack_lanes`.
 
     Raises:
-        SceneError: lengths do not fit the arrays, or it is not a graph.
+        SceneError: lengths do not match the arrays, or the graph is invalid.
     """
     taken = dict.fromkeys(arrays, 0)
 

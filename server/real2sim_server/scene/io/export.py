@@ -33,7 +33,7 @@ from .splats import FORMATS, format_to_write, upright, write_splats
 FLOAT, UNSIGNED_BYTE = 5126, 5121
 ARRAY_BUFFER = 34962
 MAX_GLB_BYTES = 0xFFFFFFFF
-"""Lengths in a glb file are 32 bits."""
+"""Maximum length of a glb file, which stores lengths in 32 bits."""
 
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 _COMPONENTS = {"float32": FLOAT, "uint8": UNSIGNED_BYTE}
@@ -183,7 +183,7 @@ class _Builder:
         }
 
     def document(self) -> dict[str, Any]:
-        """The JSON part, but for buffers and accessors."""
+        """The JSON part, except buffers and accessors."""
         document: dict[str, Any] = {
             "asset": {"version": "2.0", "generator": "real2sim", "extras": self.extras},
             "scene": 0,
@@ -205,7 +205,7 @@ class _Builder:
         return len(self.nodes) - 1
 
     def _add_cloud_node(self, cloud: GaussianCloud, node: dict[str, Any]) -> int:
-        # An accessor has at least one element, so nothing is a node without a mesh.
+        # An accessor needs at least one element, so an empty cloud becomes a node without a mesh.
         if len(cloud):
             node["mesh"] = len(self.meshes)
             self.meshes.append({"primitives": [_primitive(self.writer, cloud)]})
@@ -245,7 +245,7 @@ class _Builder:
         return self._add_node(node | _pose(camera.T_vehicle_camera @ T_OPTICAL_GLTF))
 
     def _move(self, index: int, trajectory: Trajectory) -> None:
-        """Place a node at ``t_us``, or at its first pose with channels for all of them."""
+        """Place a node at ``t_us``, or at its first pose with animation channels for all poses."""
         at = trajectory.start_us if self.t_us is None else self.t_us
         self.nodes[index] |= _pose(trajectory.transform(at))
         if self.t_us is not None:
@@ -266,7 +266,7 @@ class _Builder:
         if first > 0:
             times, scales = [np.float32(0), first], [0.0, 1.0]
         if trajectory.end_us < self.end_us:
-            # The last instant still shows the object, so the step comes right after it.
+            # The object is still visible at the last instant, so the step comes right after it.
             times.append(np.nextafter(last, np.float32(np.inf)))
             scales.append(0.0)
         if 0.0 in scales:
@@ -356,7 +356,7 @@ def export_scene(
     with file, category, size and track of each. None of them contains the sky.
 
     Args:
-        scene: to write.
+        scene: scene to write.
         out: file to write, or folder for separate object files.
         format: ``gltf``, or the suffix of a splat format without its dot.
         t_us: time to bake [us]; objects that do not exist then are omitted.
@@ -439,7 +439,7 @@ def _check_file(path: Path, suffix: str) -> None:
 def _write_folder(
     scene: Scene, objects: dict[str, SceneObject], out: Path, suffix: str, axis: UpAxis
 ) -> tuple[Path, ...]:
-    """Background and objects as files of their own, each in its own frame with ``axis`` up."""
+    """Background and objects as separate files, each in its own frame with ``axis`` up."""
     turn = invert_transform(upright(axis, 0.0))
     if out.exists() and not _is_replaceable(out):
         raise SceneError(
@@ -460,7 +460,7 @@ def _write_folder(
 
 
 def _is_replaceable(out: Path) -> bool:
-    """Whether a folder is empty or an export of this kind, so that no other data is lost."""
+    """Whether a folder is empty or an earlier export, so that no other data is overwritten."""
     if not out.is_dir():
         return False
     if not any(out.iterdir()):

@@ -1,8 +1,7 @@
-"""Packed scenes: one small file for transfer, about a third of a bundle's bytes.
+"""Packed scenes: one small file for transfer, about a third of the size of a bundle.
 
-Packed scenes and bundles have opposite requirements: a bundle is memory-mapped and keeps every bit,
-a packed scene is transferred (the demo's street is one) and read once. Splat files of other
-programs hold no tracks, cameras, sky or provenance.
+A bundle is memory-mapped and exact. A packed scene is transferred and read once, for example the
+street of the demo. Splat files of other programs contain no tracks, cameras, sky or provenance.
 
 A packed scene is quantised: centres to 1/65535 of their cloud's extent, axes to 1/3276 of a power
 of e, rotations to 1/127, opacities to 1/255, colours to half precision and the rest of the
@@ -40,7 +39,7 @@ from .document import UNCERTAINTIES, CameraPart, GaitPart, TrajectoryPart
 FORMAT, VERSION = "real2sim-packed", 1
 DOCUMENT = "scene.json"
 MAX_BYTES = 1 << 32
-"""Maximum total size of the unpacked arrays; protects from small files with huge contents."""
+"""Maximum total size of the unpacked arrays, as protection from decompression bombs."""
 MEAN_STEPS, QUAT_STEPS, OPACITY_STEPS, SH_STEPS = 65535, 127, 255, 127
 UNCERTAINTY_STEPS = 255
 """Quantisation steps of the square roots of uncertainties."""
@@ -148,7 +147,7 @@ def read_packed(path: str | PathLike[str]) -> Scene:
     """Read a packed scene.
 
     Raises:
-        BundleError: with the file and the reason: missing, cut short, of another version.
+        BundleError: names the file and the reason: missing, truncated, of another version.
     """
     file = Path(path)
     try:
@@ -161,7 +160,7 @@ def read_packed(path: str | PathLike[str]) -> Scene:
         raise
     except FileNotFoundError as error:
         raise BundleError(f"{file}: there is no such file") from error
-    # Damage shows as almost any error, depending on where it is.
+    # A damaged file can raise almost any error.
     except Exception as error:
         reason = str(error) or type(error).__name__
         raise BundleError(f"{file}: not a packed scene, or a damaged one ({reason})") from error
@@ -270,7 +269,7 @@ def _pack_cloud(cloud: GaussianCloud, key: str, arrays: Arrays) -> _PackedCloud:
 
 
 def _curve(means: NDArray[np.uint16]) -> NDArray[np.int64]:
-    """Place of quantised centres [N, 3] along a Morton curve, ten bits an axis."""
+    """Position of quantised centres [N, 3] along a Morton curve, ten bits per axis."""
     code = np.zeros(len(means), np.int64)
     coarse = (means >> 6).astype(np.int64)
     for bit in range(10):
@@ -360,7 +359,7 @@ def _cloud(part: _PackedCloud, key: str, arrays: Arrays) -> GaussianCloud:
 
 
 def _root_steps(uncertainties: Tensor) -> NDArray[np.uint8]:
-    """Small ones finer than large ones."""
+    """Quantise small uncertainties more finely than large ones."""
     return (uncertainties.cpu().sqrt() * UNCERTAINTY_STEPS).round().numpy().astype(np.uint8)
 
 
@@ -377,10 +376,10 @@ def _vector(values: NDArray[np.float64]) -> Vector3:
     return x, y, z
 
 
-# The shipped street: the demo shows it, and a worker without scenes serves it.
+# The bundled street, used by the demo and served by a worker without scenes.
 
 SHIPPED_STREET = Path(__file__).parents[2] / "demo" / "street.r2s.zip"
 """A packed scene; rebuilt by ``python -m real2sim_server.demo.street``."""
 
 DEMO_SCENE = "demo_street"
-"""Its name where it is served."""
+"""Name of the bundled street on a server."""

@@ -1,9 +1,10 @@
 """Gaussians in PLY files: INRIA's format, and the compressed one of PlayCanvas and SuperSplat.
 
-INRIA's (Kerbl et al. 2023) holds parameters before activation. The compressed one holds chunks of
-256 splats, 16 bytes a splat: each chunk gives lowest and highest position, log scale and (in newer
-files) colour, each splat a fraction in between. Facts: github.com/playcanvas/engine,
-gsplat-compressed-data.js, and github.com/playcanvas/splat-transform, decompress-ply.ts.
+INRIA's format (Kerbl et al. 2023) stores parameters before activation. The compressed format stores
+chunks of 256 splats, 16 bytes per splat. A chunk stores the minimum and maximum of position, log
+scale and (in newer files) colour; a splat stores fractions in between. Sources:
+github.com/playcanvas/engine, gsplat-compressed-data.js, and github.com/playcanvas/splat-transform,
+decompress-ply.ts.
 """
 
 from __future__ import annotations
@@ -100,8 +101,8 @@ def read_ply_header(path: Path) -> PlyHeader:
     """Parse the header of a binary PLY file.
 
     Raises:
-        BundleError: no PLY, ascii, an unknown type, list properties, doubled names, more than
-            ``MAX_HEADER_LINES``, no end.
+        BundleError: not a PLY file, ascii, an unknown type, list properties, duplicate names, more
+            than ``MAX_HEADER_LINES``, or no end of the header.
     """
     with _open(path) as file:
         lines, nbytes = _header_lines(file.read(MAX_HEADER_BYTES), path)
@@ -130,7 +131,7 @@ def read_ply_elements(path: Path) -> dict[str, NDArray[np.void]]:
     The size of the file is compared with the header before anything is read or allocated.
 
     Raises:
-        BundleError: like :func:`read_ply_header`, and where header and file size differ.
+        BundleError: like :func:`read_ply_header`, or header and file size do not match.
     """
     header = read_ply_header(path)
     _check_size(path, header)
@@ -155,7 +156,7 @@ def _open(path: Path) -> BinaryIO:
 
 
 def _header_lines(head: bytes, path: Path) -> tuple[list[str], int]:
-    """Lines that mean something between ``ply`` and ``end_header``, and where the data starts."""
+    """Lines between ``ply`` and ``end_header`` without comments, and the offset of the data."""
     lines: list[str] = []
     start = 0
     while (end := head.find(b"\n", start)) >= 0:
@@ -174,7 +175,7 @@ def _header_lines(head: bytes, path: Path) -> tuple[list[str], int]:
                 )
     if start == 0:
         raise BundleError(f"{path}: not a ply file (its first line must be 'ply')")
-    raise BundleError(f"{path}: ply header has no end_header line; the file is cut short or no ply")
+    raise BundleError(f"{path}: ply header has no end_header line; the file is truncated, or not a PLY file")
 
 
 def _byte_order(line: str, path: Path) -> str:
@@ -323,7 +324,7 @@ def _rest_names(count: int) -> tuple[str, ...]:
 
 
 def _rest_properties(path: Path, vertex: NDArray[np.void]) -> tuple[str, ...]:
-    """Names of the harmonics past the first, once they are of a whole degree."""
+    """Names of the harmonics past the first; checks that they form a whole degree."""
     given = [name for name in vertex.dtype.names or () if name.startswith("f_rest_")]
     names = _rest_names(len(given))
     if set(given) != set(names) or len(names) // 3 + 1 not in SH_DEGREES or len(names) % 3:
@@ -360,7 +361,7 @@ _SPREAD = (
 
 
 def morton_order(points: Float) -> NDArray[np.int64]:
-    """Indices [N] that sort ``points`` [N, 3] along a Z curve of 2^21 cells a side.
+    """Indices [N] that sort ``points`` [N, 3] along a Z curve of 2^21 cells per side.
 
     Cells are cubes over the longest extent of the points. Equal cells keep their order.
     """
@@ -374,7 +375,7 @@ def morton_order(points: Float) -> NDArray[np.int64]:
 
 
 def _spread(values: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Two zero bits between any two of the lowest 21 bits."""
+    """Insert two zero bits between each pair of the lowest 21 bits."""
     for shift, mask in _SPREAD:
         values = (values | values << np.uint64(shift)) & np.uint64(mask)
     return values
@@ -395,7 +396,7 @@ Words = NDArray[np.uint32]
 CHUNK_FIELDS = LOW_POSITION + HIGH_POSITION + LOW_SCALE + HIGH_SCALE + LOW_COLOUR + HIGH_COLOUR
 
 MAX_LOG_SCALE = 20.0
-"""Log scales are clamped to plus or minus this, as in the format's own writer."""
+"""Log scales are clamped to plus or minus this value, as in the format's original writer."""
 
 
 class PlayCanvasPly:
@@ -469,7 +470,7 @@ class PlayCanvasPly:
     def _checked(
         self, path: Path, elements: dict[str, NDArray[np.void]]
     ) -> tuple[NDArray[np.void], NDArray[np.void]]:
-        """Elements ``vertex`` and ``chunk`` once their properties and counts fit together."""
+        """Elements ``vertex`` and ``chunk``, with a check of their properties and counts."""
         vertex, chunks = elements.get("vertex"), elements.get("chunk")
         vertex_names = vertex.dtype.names or () if vertex is not None else None
         chunk_names = chunks.dtype.names or () if chunks is not None else None

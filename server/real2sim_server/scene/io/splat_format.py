@@ -1,6 +1,6 @@
 """The protocol of splat formats, helpers for their readers, and the headerless ``.splat``.
 
-``.splat`` comes from early web viewers: 32 bytes a splat, no view-dependent colour. Facts:
+``.splat`` comes from early web viewers: 32 bytes per splat, no view-dependent colour. Source:
 github.com/antimatter15/splat, main.js.
 """
 
@@ -22,7 +22,7 @@ UpAxis = Literal["z", "y", "-y"]
 """Axis of a file that points up: ``y`` as in glTF (z forward), ``-y`` as in OpenCV and COLMAP."""
 
 MIN_SCALE = 1e-20
-"""Minimum scale [m], for scales whose exponential underflows: scales must be positive."""
+"""Minimum scale [m]. Scales must be positive, even if their exponential underflows."""
 
 
 class SplatFormat(Protocol):
@@ -63,7 +63,7 @@ class SplatFormat(Protocol):
         """
 
     def write(self, cloud: GaussianCloud, path: Path) -> None:
-        """Write Gaussians of checked values, atomically, in the frame they are in.
+        """Write Gaussians with checked values atomically, without a change of frame.
 
         Raises:
             SceneError: for values the format cannot hold.
@@ -75,7 +75,7 @@ def check_memory(path: Path, count: int, harmonics: int, max_bytes: int | None) 
     """Reject a file by its unpacked size, independent of its compressed size.
 
     Args:
-        path: for the message.
+        path: file name for the message.
         count, harmonics: number of Gaussians, and of spherical harmonics of each.
         max_bytes: memory limit; None for no limit.
 
@@ -93,7 +93,7 @@ def check_memory(path: Path, count: int, harmonics: int, max_bytes: int | None) 
 def require_properties(
     path: Path, element: str, names: tuple[str, ...] | None, needed: tuple[str, ...]
 ) -> None:
-    """Raise BundleError unless ``element`` exists (``names`` is not None) with all ``needed``."""
+    """Raise BundleError unless ``element`` exists (``names`` is not None) and has ``needed``."""
     if names is None:
         raise BundleError(f"{path}: has no {element!r} element")
     missing = [name for name in needed if name not in names]

@@ -24,7 +24,7 @@ from .spz import Spz
 HEAD_BYTES = 1 << 16
 
 FORMATS: list[SplatFormat] = [PlayCanvasPly(), InriaPly(), Spz(), AntimatterSplat()]
-"""In order of precedence, for files and for names."""
+"""All formats in order of precedence, for contents and for file names."""
 
 _ROTATIONS: dict[str, list[list[float]]] = {
     "z": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
@@ -118,7 +118,7 @@ def up_axis_of(path: str | PathLike[str]) -> UpAxis | None:
         said = re.search(rb"^comment up_axis (z|y|-y)\r?$", head.split(b"end_header")[0], re.M)
         return cast("UpAxis", said[1].decode()) if said else None
     known = (f.up_axis for f in FORMATS if f.recognises(head))
-    # A format without a convention has the scene's own axis.
+    # A format without a convention uses the axis of scenes.
     return next((axis for axis in known if axis != "z"), None)
 
 
@@ -126,7 +126,7 @@ def format_to_write(path: Path) -> SplatFormat:
     """The format that the name of ``path`` ends with.
 
     Raises:
-        SceneError: where it ends with none.
+        SceneError: the suffix is unknown.
     """
     for splat_format in FORMATS:
         if path.name.lower().endswith(splat_format.suffix):
@@ -223,7 +223,8 @@ def asset_from_cloud(
 def scene_from_cloud(cloud: GaussianCloud, *, name: str, provenance: dict[str, Any]) -> Scene:
     """A scene with ``cloud`` as background, seen along x by one camera that covers its robust box.
 
-    The ego stands behind the box for ten seconds; its camera ``front`` looks at the box's centre.
+    The ego is stationary behind the box for ten seconds. Its camera ``front`` looks at the box's
+    centre.
     """
     low, high = robust_bounds(cloud)
     centre, extent = (low + high) / 2, np.maximum(high - low, 1e-3)

@@ -1,6 +1,6 @@
-"""Niantic's ``.spz``, versions 1 to 4: quantised attributes, one after the other, compressed.
+"""Niantic's ``.spz``, versions 1 to 4: quantised and compressed attributes.
 
-Facts: github.com/nianticlabs/spz, README.md and load-spz.cc.
+Source: github.com/nianticlabs/spz, README.md and load-spz.cc.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ MAX_REST = 15
 """Maximum number of harmonics past the first in a cloud; those of degree 4 are dropped."""
 
 MAX_SPLATS = 20_000_000
-"""Larger files are rejected; the largest street scenes have a few million."""
+"""Maximum number of splats; the largest street scenes have a few million."""
 
 ZSTD_LEVEL = 12
 GZIP_LEVEL = 6
@@ -58,7 +58,7 @@ class Header:
 
     @property
     def harmonics(self) -> int:
-        """Spherical harmonics of each splat once read."""
+        """Number of spherical harmonics of each splat after reading."""
         return 1 + min(MAX_REST, (self.sh_degree + 1) ** 2 - 1)
 
     @property
@@ -120,7 +120,7 @@ def read_streams(path: Path, *, max_bytes: int | None = None) -> tuple[Header, S
         header = _header(path, inflated, versions=(1, 2, 3))
         check_memory(path, header.count, header.harmonics, max_bytes)
         wanted = HEADER.size + sum(header.stream_sizes.values())
-        # One byte more than may be there tells a file that is too long.
+        # Reading one extra byte detects a file that is too long.
         data = _inflate_gzip(path, data, wanted + _extension_room(header) + 1)
         return header, _cut(path, header, data)
     header = _header(path, data, versions=(1, 2, 3, 4))
@@ -129,8 +129,7 @@ def read_streams(path: Path, *, max_bytes: int | None = None) -> tuple[Header, S
 
 
 def write_streams(header: Header, streams: Streams, *, gzip_level: int = GZIP_LEVEL) -> bytes:
-    """A whole file of version 3 (gzip, ``gzip_level`` 1 to 9) or 4 (zstd); the same streams give
-    the same bytes."""
+    """A complete file of version 3 (gzip, ``gzip_level`` 1 to 9) or 4 (zstd). Deterministic."""
     parts = [getattr(streams, name).tobytes() for name in header.stream_sizes]
     values = (header.version, header.count, header.sh_degree, header.fractional_bits, header.flags)
     if header.version < 4:
@@ -265,7 +264,7 @@ COLOUR_SCALE = 0.15
 """Coefficients of the first harmonic per full range of a byte."""
 
 FRACTIONAL_BITS = 12
-"""Positions are multiples of 2^-12 (a quarter of a millimetre) unless they reach too far."""
+"""Positions are multiples of 2^-12 (a quarter of a millimetre) unless their range is too large."""
 
 SH_BITS = (5, 4, 4)
 """Significant bits of harmonics of degree 1, 2, 3; the other bits are zero and compress away."""
@@ -285,7 +284,7 @@ class Spz:
     [-1, 0.992]. Harmonics of degree 4 are dropped when read; extensions are skipped.
 
     Args:
-        version: of the files to write: 3 (gzip, supported by most viewers) or 4 (zstd, smaller).
+        version: version of written files: 3 (gzip, supported by most viewers) or 4 (zstd, smaller).
         gzip_level: 1 (fast) to 9 (small), of version 3.
     """
 
@@ -319,7 +318,7 @@ class Spz:
         )
 
     def write(self, cloud: GaussianCloud, path: Path) -> None:
-        """Write ``cloud`` in its order.
+        """Write ``cloud`` in its current order.
 
         Raises:
             SceneError: positions beyond the range of 24 bits of whole units (8 million).
@@ -423,7 +422,7 @@ def _packed_rotations(quats: Float) -> Bytes:
 
 
 def _packed_harmonics(rest: Float) -> Bytes:
-    """Harmonics past the first [N, K - 1, 3] as bytes; zero is always exact."""
+    """Harmonics past the first [N, K - 1, 3] as bytes. Zero is exact."""
     codes = np.empty(rest.shape, dtype=np.uint8)
     for degree, bits in enumerate(SH_BITS, start=1):
         band = slice(degree * degree - 1, (degree + 1) ** 2 - 1)

@@ -82,7 +82,7 @@ class SceneSummary:
 
     @cached_property
     def lanes(self) -> LaneGraph | None:
-        """The lanes of the scene, read on first access; None if it has none.
+        """The lanes of the scene, read on first access; None without lanes.
 
         Raises:
             BundleError: the bundle is damaged, or another one has replaced it.

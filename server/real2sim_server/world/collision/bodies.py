@@ -111,7 +111,7 @@ def integrate_sliding(
 
     Args:
         body, properties: the body.
-        h: at most 10 ms.
+        h: duration, at most 10 ms [s].
         acceleration: by engine or brakes, along the front wheels' axle frame [m/s^2].
         steering: road-wheel angle of the front axle [rad].
     """

@@ -381,7 +381,7 @@ def advance_pulse(
         bodies: both bodies; None for an immovable one.
         pulse: impact so far.
         patch: current overlap.
-        h: [s].
+        h: duration [s].
         friction: friction coefficient.
     """
     nx, ny = pulse.along(bodies)

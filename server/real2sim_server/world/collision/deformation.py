@@ -56,7 +56,7 @@ class VehicleDamage:
     broken: tuple[Breakage, ...] = ()
 
     def hanging(self, t_us: int) -> int:
-        """Time at which loose parts are drawn [us]; constant once they are still."""
+        """Time at which loose parts are drawn [us]; constant once they are at rest."""
         fell = [b.time_s for b in self.broken if b.kind == "bumper"]
         if not fell:
             return 0
@@ -180,7 +180,7 @@ POLE = 0.25
 
 
 FOR_GOOD = 2**62
-"""A time after the end of every impact [us]."""
+"""Time after the end of every impact [us]."""
 
 
 class Deformation(Protocol):
@@ -192,7 +192,7 @@ class Deformation(Protocol):
 
     @property
     def has_impacts(self) -> bool:
-        """Whether there is anything to solve, now or later."""
+        """Whether a deformation may have to be solved, now or later."""
 
     def with_impact(self, impact: Impact, subjects: Mapping[str, ObjectState]) -> Self:
         """After an impact; ``subjects``: all objects by id."""
@@ -454,7 +454,7 @@ class _DeformedObject:
         if not frames:
             return self.before.cloud(t_us) if self.before is not None else None
         damage = self.damage(t_us)
-        # A loose bumper keeps sinking for a while.
+        # A loose bumper continues to sink for a while.
         key = (len(frames), 0 if damage is None else damage.hanging(t_us))
         with self.origin.lock:
             if self._shown is None or self._shown[0] != key:
@@ -527,7 +527,7 @@ class _ImpactSolution:
             return self._outcomes
 
     def _attempt(self, ask: Callable[[crash.ImpactSimulation], T], nothing: T) -> T:
-        """Query the simulation; ``nothing`` if the solver fails."""
+        """Query the simulation; return ``nothing`` if the solver fails."""
         if self._failed:
             return nothing
         try:
@@ -535,7 +535,7 @@ class _ImpactSolution:
                 self._simulation = self._begin()
             return ask(self._simulation)
         except PhysicsError as error:
-            # Prefer an image without deformation to ending the episode.
+            # An image without deformation is better than the end of the episode.
             self._failed = True
             _log.warning(
                 "no deformation after the impact at %s us: %s", self.impact.began_us, error
@@ -579,7 +579,7 @@ class _ImpactSolution:
         return transform_from(centre, yaw_quaternion(body.yaw))
 
     def _wall(self) -> Box:
-        """The obstacle that the object hit, as broad as the background there."""
+        """The obstacle that the object hit, with the breadth of the background there."""
         nx, ny = self.impact.normal
         depth, width, height = WALL
         right, left = self.impact.breadth or (width / 2, width / 2)

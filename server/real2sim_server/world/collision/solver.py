@@ -138,7 +138,7 @@ def solve_collisions(step: CollisionStep) -> CollisionResult:
         pushed = _resolve_contacts(state, (end - begin) * 1e-6)
         if pushed or sliding:
             motion = ego_motion(state.bodies[EGO], motion, step.spec)
-            # Lasting contacts push a little in each substep, and the wheels must not undo this.
+            # Lasting contacts push a little in each substep, which the wheels must not undo.
             going_on = pushed and step.contact.progressive
             sliding = going_on or not is_rolling(motion, step.spec)
     return CollisionResult(

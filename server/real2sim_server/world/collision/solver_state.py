@@ -327,7 +327,7 @@ def advance_face_pulse(
         bodies: both bodies; None for an immovable one.
         pulse: impact so far.
         contact: current overlap.
-        h: [s].
+        h: duration [s].
         friction: friction coefficient.
         progressive: whether the force grows with closing speed and superlinearly with depth.
     """

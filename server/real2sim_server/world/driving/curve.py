@@ -31,7 +31,7 @@ TRUSTED_YAW = 0.5
 
 
 NO_POSE = math.nan, 0.0, 0.0, 0.0
-"""``before`` of a plan that does not continue an earlier pose."""
+"""Value of ``before`` for plans that do not continue an earlier pose."""
 
 
 class PlanCurve(NamedTuple):
@@ -142,8 +142,8 @@ def heading(curve, t):
 def _slope(knots, i):
     """Velocity [m/s] at a plan pose: slope of the parabola through three neighbouring poses.
 
-    The vehicle's own pose is excluded: if it is off the plan, the segment from it says nothing
-    about the planned speed.
+    The vehicle pose is excluded: if it is off the plan, the segment from it does not represent
+    the planned speed.
     """
     last = len(knots) - 1
     if last == 2:
@@ -260,7 +260,7 @@ def _along_changing_arc(knot, rate, gain, since):
         return knot[X], knot[Y], 0.0, 0.0
     if speed + gain * since < 0.0:
         since = -speed / gain
-    # As long as the arc would take at the knot's own speed.
+    # The time that the arc would take at the speed of the knot.
     alike = since * (1.0 + gain * since / (2 * speed))
     x, y, vx, vy = _along_arc(knot, rate, alike)
     share = (speed + gain * since) / speed

@@ -95,7 +95,7 @@ def lagging_gains(lag):
     root is w / lag^2 with w^3 = w^2 + lag^4.
 
     Args:
-        lag: in units of the regulator's scale.
+        lag: time constant in units of the regulator's scale.
 
     Returns:
         b and c; sqrt(2) and 0 without a lag.
@@ -149,7 +149,7 @@ def _steering_onto(point, coming, state, vehicle):
     """
     dx, dy = state.x - point.x, state.y - point.y
     across = dy * math.cos(point.yaw) - dx * math.sin(point.yaw)
-    # Direction of motion: with tyre slip it differs from the heading.
+    # With tyre slip, the direction of motion differs from the heading.
     direction = state.yaw + math.atan2(state.lateral_speed, max(state.speed, 1.0))
     off = wrapped(direction - point.yaw)
     scale = max(HEADWAY * state.speed, SHORTEST)
@@ -536,7 +536,7 @@ def _linearise(A, B, along, model):
 
 @func
 def _product(result, M, N):
-    """Writes M N."""
+    """Write M N."""
     for i in range(M.shape[0]):
         for j in range(N.shape[1]):
             total = 0.0
@@ -547,7 +547,7 @@ def _product(result, M, N):
 
 @func
 def _transposed(result, M, N):
-    """Writes M^T N."""
+    """Write M^T N."""
     for i in range(M.shape[1]):
         for j in range(N.shape[1]):
             total = 0.0

@@ -257,7 +257,7 @@ def integrate(vehicle, state, steering, acceleration, h):
         state: state of the centre of mass, see :func:`rates`.
         steering: angle at the start and the end, linear in between [rad].
         acceleration: by engine or brakes [m/s^2].
-        h: at most 10 ms; the fastest time constant is that of the tyres, about 1/(60 vx) s.
+        h: duration, at most 10 ms [s]; the fastest time constant, of the tyres, is 1/(60 vx) s.
     """
     begin, end = steering
     middle = (begin + end) / 2
@@ -333,7 +333,7 @@ def fiala(slip, stiffness, limit):
 
     Args:
         slip: angle from the wheel's motion to its heading [rad]; the force has its sign.
-        stiffness: at zero slip [N/rad].
+        stiffness: stiffness at zero slip [N/rad].
         limit: friction times load, reduced by the longitudinal force [N].
     """
     if limit <= 0.0:

@@ -306,7 +306,7 @@ def _teleport(actor: EntityState, action: TeleportAction, at: Beginning) -> Enti
 
 
 def _is_near_route(place: Place, route: Way) -> bool:
-    """Whether a place is near enough to a route, and roughly along it, to start driving it."""
+    """Whether a place is near a route and roughly aligned with it, so that it can be followed."""
     near = route.path.nearest(place.x, place.y)
     # Use points of the route: its headings change between places that may be far apart.
     (x0, y0, *_), (x1, y1, *_) = (route.path.at(near.s + ds) for ds in (-0.5, 0.5))

@@ -368,7 +368,7 @@ class Synchronize:
         """Constant acceleration to arrive in time."""
         rate = 2 * (d - v * time) / time**2
         if v + rate * time < 0.0:
-            # A constant acceleration would overshoot and return, so it stops at its target instead.
+            # A constant acceleration would overshoot and return, so the entity stops at its target.
             return -v * v / (2 * max(d, DONE))
         return rate
 

@@ -86,7 +86,7 @@ class Element:
 
     @property
     def label(self) -> str:
-        """Its names joined."""
+        """The joined names of the path."""
         return "::".join(self.path)
 
     def within(self) -> Iterator[Element]:

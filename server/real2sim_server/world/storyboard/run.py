@@ -293,7 +293,7 @@ class StoryboardRun:
         state: elements, conditions, variables.
         drivers: drivers of the objects that it moves, by object id.
         changes: element changes of the last step.
-        ego_put: whether it has placed the ego at the start.
+        ego_put: whether the storyboard placed the ego at the start.
         ego: name of the ego among the entities, or None.
         elapsed: time since the start of the episode [s].
         sampled: sampled values by name.

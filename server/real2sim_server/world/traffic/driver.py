@@ -214,7 +214,7 @@ def pose_moved_back(pose: AgentPose, route: LoggedPath, way: float) -> AgentPose
     """
     x, y, z = pose.position
     near = route.nearest(x, y)
-    # The route continues straight beyond its ends, but the nearest point there is the end itself.
+    # The route continues straight beyond its ends, but the nearest point there is its end.
     beyond = (x - near.position[0]) * math.cos(near.yaw)
     beyond += (y - near.position[1]) * math.sin(near.yaw)
     px, py, _, yaw = route.at(near.s + beyond - way)

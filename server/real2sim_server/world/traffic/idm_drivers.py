@@ -126,8 +126,8 @@ SETTLES = 2.0
 MIN_CHANGE_SPEED = 3.0
 """Minimum speed for lane changes [m/s]."""
 DECIDES_EVERY = 1.0
-"""Interval between lane change decisions [s]. Each driver decides at its own phase: two that always
-decide at once would yield to each other forever."""
+"""Interval between lane change decisions [s]. Drivers decide at different phases, because two that
+always decide at once would yield to each other forever."""
 RENEWED = 200.0
 """Remaining length at which the lane chain is extended [m]."""
 
@@ -205,7 +205,7 @@ class LaneChanger:
     # --- changes of lanes -------------------------------------------------------------------------
 
     def _in_the_better_lane(self, surroundings: Surroundings) -> Self:
-        """The driver at the start of a lane change, if that pays; the left lane wins ties."""
+        """The driver at the start of a lane change if that is beneficial; ties go to the left."""
         graph, lane = surroundings.lanes, self.way.lane_at(self.s)
         ready = self.changing is None and self.settled >= SETTLES and self.speed > MIN_CHANGE_SPEED
         if graph is None or not (ready and self.spec.changes and self._decides(surroundings)):

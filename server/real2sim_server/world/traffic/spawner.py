@@ -182,7 +182,7 @@ class Spawner:
         surroundings: Surroundings,
         active: list[AgentDriver],
     ) -> Idm | None:
-        """An object at the edge of the range from which it drives into it, else at the other."""
+        """An object at the edge from which it drives into the range, else at the other edge."""
         lane = self.lanes[number]
         bodies = list(_bodies_in(lane.path, agents, surroundings))
         here = lane.path.nearest(surroundings.ego.x, surroundings.ego.y).s
@@ -259,7 +259,7 @@ def _lane(spec: LaneSpec, route: LoggedPath, looks: tuple[ObjectState, ...]) -> 
 def _faces_along(subject: ObjectState, path: LoggedPath) -> bool:
     """Whether an object was recorded heading along the path.
 
-    Its appearance is known then from the viewpoints of the ego.
+    Its appearance is then known from the ego's viewpoints.
     """
     x, y, _ = subject.trajectory.positions[0].tolist()
     yaw = float(quaternion_yaw(subject.trajectory.quaternions[0]))

@@ -44,8 +44,8 @@ from .spawner import PREFIX as SPAWNED
 from .spawner import Spawner
 
 BeginDriver = Callable[[ObjectState, Any, Surroundings], AgentDriver]
-"""``begin(subject, spec, surroundings)``: creates the driver of an object from the instant of the
-surroundings; ``spec`` has the type that the function is registered for."""
+"""``begin(subject, spec, surroundings)``: creates the driver of an object at the instant of the
+surroundings. ``spec`` has the type for which the function is registered."""
 
 DRIVERS: dict[type[Any], BeginDriver] = {
     ReplayDriver: Replay.begin,
@@ -301,7 +301,7 @@ class Traffic:
         return replace(self, drivers=merged, agents=_with_driver_poses(base, merged))
 
     def _with_new_drivers(self, base: Agents, surroundings: Surroundings) -> Traffic:
-        """With drivers for objects that have just appeared."""
+        """Objects with drivers for those that have just appeared."""
         drivers, sampled = dict(self.drivers), dict[str, float]()
         if self._assigns_drivers:
             for subject in base.objects:
@@ -324,7 +324,7 @@ class Traffic:
         return replace(traffic, spawner=spawner)._with_spawned(added, base)
 
     def _with_spawned(self, added: Sequence[Idm], base: Agents) -> Traffic:
-        """With more spawned objects."""
+        """Objects with additional spawned ones."""
         if not added:
             return self
         assert self.spawner is not None

@@ -129,7 +129,7 @@ class BlockSimulation:
             self._arrange(colliders)
 
     def measure(self) -> Measure:
-        """Sums in float64, added in the order of blocks."""
+        """Sums in float64, in the order of blocks."""
         layout, bodies = self._layout, self._model.bodies
         rows, block = self._measure_blocks()
         # The middle one of the fields around a block is the block's own.
@@ -317,8 +317,8 @@ def _block_of(cells: Any) -> Int:
 
 
 PARTICLES_PER_THREAD = 5000
-"""Minimum number of particles per thread. More threads would gain little, and wait for each other
-on a busy machine."""
+"""Minimum number of particles per thread. More threads gain little and wait for each other on a
+busy machine."""
 
 
 class CpuSolverBackend:

@@ -193,7 +193,7 @@ def _way_back(context: Any, builder: Any, signature: Any, arguments: Any) -> tup
 
 
 _F, _L, _TAU, _ENERGY, _VOLUME, _MU, _LAMBDA, _ETA, _OFF = 0, 9, 18, 24, 25, 26, 27, 28, 29
-"""Rows of the scratch space, BATCH numbers each; _OFF marks lanes that did not converge or yield.
+"""Rows of the scratch space, BATCH numbers each. _OFF marks lanes that yield or did not converge.
 """
 _LOW, _HIGH, _TOTAL = 30, 31, 32
 """Plastic laws: bounds of the principal stretches, and the total deformation."""
@@ -209,7 +209,7 @@ FLOWN = TWO
 FEW = 2
 """Minimum number of yielding lanes in a batch to process them together."""
 
-# LLVM does not inline this function by itself, and calls prevent vectorisation.
+# Force inlining, because calls prevent vectorisation.
 sweep: Any = inner(forceinline=True)(jacobi_sweep)
 
 
@@ -474,7 +474,7 @@ def lane_symmetric(s: Any, lane: Any) -> Any:
 
 @inner()
 def neo_hookean_batch(dt: Any, s: Any) -> None:
-    """Neo-Hookean stress of all lanes; logarithms do not vectorise, so they have their own loop."""
+    """Neo-Hookean stress of all lanes. Logarithms do not vectorise and have a separate loop."""
     for lane in range(BATCH):
         F = advance_gradient(lane_matrix(s, _F, lane), lane_matrix(s, _L, lane), dt)
         for c in range(9):

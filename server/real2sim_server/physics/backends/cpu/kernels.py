@@ -397,7 +397,7 @@ def gather_blocks(
                 )
             deform_all(begin, end, dt, state, params.table, work.scratch[chunk])
             set_flag(work.needs_resort, block, left_tile)
-            # Particles that left the tile cannot be scattered to it; sort all particles first.
+            # Particles outside the tile cannot be scattered to it: sort all particles first.
             if scatter_next and not left_tile:
                 scatter_block(block, dt, state, layout, work, params)
 

@@ -90,7 +90,7 @@ class CudaSimulation:
         self._memory.upload(self._memory.sets[0], self._loaded(model.start))
         self._report = np.zeros(len(self._memory.report), np.uint8)
         self._keep = False  # Whether sorting keeps particles in their current blocks.
-        self._stale = True  # Whether particles must be sorted first.
+        self._stale = True  # Whether particles must be sorted before the next substep.
         self._moved = 0.0  # Maximum collider motion since the last sort [m].
         self._memory.upload_step(0.0, False, rows)
         done = 0
