@@ -201,7 +201,7 @@ def write_report(
     parts.append("<h2>Recorded and rendered</h2>")
     parts.append(
         f"<p>Errors from black (none) to yellow ({ERROR_FULL:.0f} of 255 and more); depth from red "
-        f"({DEPTH_NEAR:.0f} m) to blue ({DEPTH_FAR:.0f} m), black where nothing is.</p>"
+        f"({DEPTH_NEAR:.0f} m) to blue ({DEPTH_FAR:.0f} m), black without depth.</p>"
     )
     for frame in frames:
         parts += [_view(subject, camera, frame) for camera in cameras]

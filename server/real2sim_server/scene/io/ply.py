@@ -175,7 +175,7 @@ def _header_lines(head: bytes, path: Path) -> tuple[list[str], int]:
                 )
     if start == 0:
         raise BundleError(f"{path}: not a ply file (its first line must be 'ply')")
-    raise BundleError(f"{path}: ply header has no end_header line; the file is truncated, or not a PLY file")
+    raise BundleError(f"{path}: ply header has no end_header line; truncated, or not a PLY file")
 
 
 def _byte_order(line: str, path: Path) -> str:
