@@ -34,7 +34,7 @@ def progress_along_route(accumulator: MetricAccumulator) -> float:
 
 
 def relative_progress(accumulator: MetricAccumulator, context: ScoringContext) -> float:
-    """Progress as a fraction of the recorded drive, at most 1; 1 if that is stationary."""
+    """Progress as a fraction of the recorded drive, at most 1; 1 if that drive is stationary."""
     expert = expert_progress(accumulator, context)
     if expert < MIN_ROUTE:
         return 1.0
