@@ -214,7 +214,7 @@ class _EngineJob:
 
 
 class Engine:
-    """Runs jobs one after another on its own thread.
+    """Runs jobs one after another on a dedicated thread.
 
     All computation runs here, so kernels never compete for cores and the event loop never waits for
     them. A job is a plain function; its exceptions are raised in the caller. Jobs are scheduled as

@@ -189,7 +189,7 @@ class Connection:
         )
 
     async def serve(self, hello: Hello) -> None:
-        """Serve until either side leaves. A vanished client is not an error."""
+        """Serve until either side disconnects. A lost client is not an error."""
         session = self._session
         try:
             session.check_open()

@@ -128,14 +128,14 @@ def _read(data: bytes) -> ClientMessage:
 
 
 def bad_message(detail: str) -> ServiceError:
-    """BAD_MESSAGE."""
+    """A BAD_MESSAGE error."""
     return ServiceError(
         ErrorCode.BAD_MESSAGE, detail, hint=f"messages are msgpack maps with a type: {TYPES}"
     )
 
 
 def unsupported_protocol(offered: list[str]) -> ServiceError:
-    """UNSUPPORTED_PROTOCOL, with the versions of both sides."""
+    """An UNSUPPORTED_PROTOCOL error with the versions of both sides."""
     return ServiceError(ErrorCode.UNSUPPORTED_PROTOCOL, protocol_mismatch(offered))
 
 

@@ -9,7 +9,7 @@ phase         runs on         purpose
 ``render``    engine          deformations, then images and clouds of the due sensors
 ``evaluate``  worlds, during  metrics and events; write the log entry; pack the observation without
               rendering       its images
-``encode``    encoders        encode images, copy raw ones into shared memory; join the parts into
+``encode``    encoders        encode images or copy raw ones into shared memory; join the parts into
                               one message
 ``send``      event loop      write the message to the socket (`connection`)
 ============  ==============  ====================================================================
@@ -59,7 +59,7 @@ MAX_TOGETHER_DRAWN = 8
 MAX_PIXELS_TOGETHER = 16_000_000
 """Maximum number of pixels in a batch of steps with images."""
 MAX_WAITING = 1024
-"""Maximum number of steps waiting for the thread of worlds."""
+"""Maximum number of steps waiting for the world thread."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +88,7 @@ class EncodedObservation:
         frames: images of the message.
         message: complete message for all recipients.
         timing_ms: durations by stage.
-        placed: message for the answered client, if its images are in shared memory.
+        placed: message for the requesting client, if its images are in shared memory.
         clouds: point clouds of the message.
     """
 
@@ -101,7 +101,7 @@ class EncodedObservation:
 
     @property
     def answer(self) -> EncodedMessage:
-        """The message for the answered client."""
+        """The message for the requesting client."""
         return self.placed or self.message
 
 
@@ -123,7 +123,7 @@ class Step:
         images, measured: their results, in order.
         members: members of the message, without images, clouds and timing.
         recorded: whether ``log`` is written.
-        error: reason for a failure.
+        error: error of a failed step.
     """
 
     change: Callable[[], World]

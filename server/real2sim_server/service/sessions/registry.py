@@ -168,8 +168,8 @@ class SessionLimits:
     Attributes:
         worker_id: first part of session ids.
         max_sessions: maximum number of open sessions.
-        idle_seconds: time without use and without connection after which a session leaves the
-            memory; a later request rebuilds it from its log.
+        idle_seconds: time without use or connection after which a session is evicted from memory;
+            a later request rebuilds it from its log.
     """
 
     worker_id: str
@@ -248,7 +248,10 @@ class Sessions:
 
     @asynccontextmanager
     async def running(self) -> AsyncIterator[Sessions]:
-        """Evict idle sessions during the block, and end the open ones after it."""
+        """Run the step pipeline and evict idle sessions during the block.
+
+        New sessions are refused after it.
+        """
         self.pipeline.start()
         evicting = asyncio.create_task(self._evict_idle(), name="idle-sessions")
         try:
@@ -280,8 +283,8 @@ class Sessions:
             ws_base: address of this worker for clients, for example ``ws://127.0.0.1:8600``.
 
         Raises:
-            ServiceError: OVER_CAPACITY or DRAINING; INVALID_REQUEST; or as for scene cache and
-                scenarios.
+            ServiceError: OVER_CAPACITY, DRAINING, INVALID_REQUEST, or an error of the scene cache
+                or the scenarios.
             WorldError: the episode cannot run with these options.
         """
         if (scene is None) == (scenario is None):
@@ -659,7 +662,7 @@ def check_not_closed(row: SessionRow) -> SessionRow:
 
 
 def elsewhere(session_id: str) -> ServiceError:
-    """SESSION_ELSEWHERE."""
+    """A SESSION_ELSEWHERE error."""
     return ServiceError(
         ErrorCode.SESSION_ELSEWHERE,
         f"session {session_id!r} is another worker's",

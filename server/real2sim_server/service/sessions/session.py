@@ -72,7 +72,7 @@ class LockStep(Generic[A]):
         self.over = True
 
     def restore_answer(self, content: bytes, answer: A) -> None:
-        """Restore the answer to the last step, after a replay."""
+        """Restore the answer to the last step after a replay."""
         self._last = (content, answer)
 
     def cached_answer(self, step: int, content: bytes) -> A | None:
@@ -84,7 +84,7 @@ class LockStep(Generic[A]):
 
         Raises:
             ServiceError: NOT_RESET; STEP_CONFLICT if the step had another action;
-                STALE_STEP for older steps; EPISODE_OVER; BAD_STEP for newer steps.
+                STALE_STEP for older steps; BAD_STEP for newer steps; EPISODE_OVER.
         """
         if self.step is None:
             raise not_reset()
@@ -133,7 +133,7 @@ class LockStep(Generic[A]):
 
 
 def not_reset() -> ServiceError:
-    """NOT_RESET."""
+    """A NOT_RESET error."""
     return ServiceError(
         ErrorCode.NOT_RESET,
         "no episode has begun in this session",
@@ -293,15 +293,15 @@ class Session:
         unsure_replies: keys of replies that may be stored although they never took effect.
         snapshots: saved states by name.
         newest: observation of the current step, if it has been computed.
-        late: whether the planner has missed the deadline of the due action, and the clock waits.
-        expires_at: monotonic time at which the episode is cut off [s]; None for never.
+        late: whether the planner has missed the deadline of the due action while the clock waits.
+        expires_at: monotonic time at which the episode is ended [s]; None for no limit.
         controller: the connection that drives, if any.
         tell_controller: sends the controller an observation that answers no action.
         hold: gates the clock.
         newest_plan: newest plan of the controller.
         observers: queues of the observers' connections.
         close_callbacks: one for each open connection.
-        closed: why the session has ended; None while it is open.
+        closed: reason for the end of the session; None while it is open.
     """
 
     row: SessionRow
@@ -394,7 +394,7 @@ def opens_session(token: str | None, row: SessionRow) -> bool:
 
 
 def controller_taken(session_id: str) -> ServiceError:
-    """CONTROLLER_TAKEN."""
+    """A CONTROLLER_TAKEN error."""
     return ServiceError(
         ErrorCode.CONTROLLER_TAKEN,
         f"session {session_id!r} has a controller on its drive socket",
@@ -506,8 +506,7 @@ def welcome_fields(session: Session, role: str) -> dict[str, Any]:
 
 
 def result_fields(world: World | None, scores: Sequence[Score]) -> dict[str, Any]:
-    """Members of the protocol's Result, without envelope; ``world`` is the last
-    one, if any."""
+    """Members of the protocol's Result, without envelope; ``world`` is the last world, if any."""
     return {
         "steps": world.steps if world else 0,
         "t_us": world.t_us if world else None,

@@ -260,7 +260,7 @@ HUGSIM_LON_JERK = 8.37
 class ComfortSample(NamedTuple):
     """Motion that passengers feel at one time, in SI units.
 
-    ``lon_acceleration`` is in the direction of the gear: negative values are braking, also in
+    ``lon_acceleration`` is in the direction of the gear: negative values are braking, even in
     reverse.
     """
 

@@ -569,7 +569,7 @@ NO_LIGHTS = TrafficLights()
 def shows_red(state: str) -> bool:
     """Whether a signal state means stop.
 
-    Stop states are ``red``, also in combination (``red;amber``), ``stop``, and lamp lists with the
+    Stop states are ``red``, even in combination (``red;amber``), ``stop``, and lamp lists with the
     first lamp on (``on;off;off``, red first as in OpenDRIVE).
     """
     words = re.findall(r"[a-z]+", state.lower())
@@ -581,8 +581,8 @@ def shows_red(state: str) -> bool:
 def stop_lines(signal: ShownSignal, context: ScoringContext) -> Iterator[StopLineAt]:
     """Stop lines of a signal.
 
-    Uses the line of the storyboard, as wide as a lane, else the stop line of the map, else the
-    ends of the signal's lanes. Empty if none is known.
+    Uses the line of the storyboard with the width of a lane. Without one, uses the stop line of the
+    map, or else the ends of the signal's lanes. Empty if none is known.
     """
     graph = None if context.road_map is None else context.road_map.graph
     if signal.stop_line is not None:

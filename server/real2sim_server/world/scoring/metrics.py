@@ -28,7 +28,7 @@ NO_MAP = "no map: corridor and lanes come from the recorded drive"
 
 
 def progress_along_route(accumulator: MetricAccumulator) -> float:
-    """Progress along the route [m], without reverse driving and distance skipped by short cuts."""
+    """Progress along the route [m], excluding reverse driving and short cuts."""
     driven = accumulator.s - accumulator.tail_first - accumulator.cut
     return max(driven - accumulator.start_s, 0.0)
 
