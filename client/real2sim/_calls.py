@@ -325,9 +325,9 @@ def _wire_cloud(value: Any) -> WireCloud:
 
 
 def describe(error: ValidationError, model: type[BaseModel] | None = None) -> str:
-    """The errors in one line: ``sensors/0/width: input should be ...``.
+    """Up to four errors in one line: ``sensors/0/width: input should be ...``.
 
-    For an unknown member of the model, it suggests a similar name.
+    For an unknown member of the model, suggests a valid name.
     """
     members = list(model.model_fields) if model else []
     problems = []
@@ -388,7 +388,7 @@ def checked(model: type[M], /, **fields: Any) -> M:
     """A model with these fields.
 
     Raises:
-        ValueError: lists every invalid field with the reason.
+        ValueError: lists up to four invalid fields with the reasons.
     """
     try:
         return model(**fields)

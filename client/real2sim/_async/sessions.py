@@ -137,7 +137,7 @@ class AsyncSessions(AsyncCollection[SessionInfo]):
     async def step(
         self, session_id: str, *, n: int = 1, plan: Plan | Mapping[str, Any] | None = None
     ) -> SessionState:
-        """Run ``n`` clock steps under one plan; default: the last plan, or the log before any plan.
+        """Run ``n`` clock steps under one plan; default: the last plan, or else the recorded drive.
 
         Examples:
             >>> state = await client.sessions.step(info.session_id, n=5)

@@ -375,7 +375,7 @@ class StepPipeline:
         return observation
 
     def _draw(self, steps: Sequence[Step]) -> None:
-        """Render the images of a batch of steps; none of them if one fails."""
+        """Render the images of a batch of steps. If one fails, none has images."""
         requests = [(_request(s.moved, s.sensors), _cameras(s)) for s in steps]
         for step, images in zip(steps, self._renderer.render_together(requests), strict=True):
             step.images = _estimated(step.moved, images)
@@ -404,7 +404,7 @@ class StepPipeline:
         Args:
             world: the world at that step.
             sensors: the cameras.
-            ranging: LiDARs and radars, all of them due.
+            ranging: LiDARs and radars, all due.
             slot: shared memory slot for raw images.
 
         Raises:

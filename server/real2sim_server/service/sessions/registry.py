@@ -337,7 +337,7 @@ class Sessions:
         """
         if (session := self._open.get(session_id)) is not None:
             return session.row
-        # Ids of another format are not queried; the database may reject some of them.
+        # Do not query ids of another format, because the database may reject them.
         row = await self._store.session(session_id) if _ID.fullmatch(session_id) else None
         if row is None:
             hint = "GET /v1/sessions lists them"
@@ -466,7 +466,7 @@ class Sessions:
         return await self.pipeline.on_world_thread(score)
 
     async def close(self, session: Session, *, reason: str) -> None:
-        """End a session after its step in progress; idempotent."""
+        """End a session after the step in progress; idempotent."""
         if self._open.pop(session.session_id, None) is None:
             return
         session.closed = _closed(session.session_id, reason)

@@ -448,7 +448,7 @@ def session_state(session_id: str, world: World, events: Iterable[Event]) -> Ses
 
 
 def shown_state(session: Session) -> SessionState:
-    """As :func:`session_state`, with the newest plan, for observers."""
+    """Like :func:`session_state`, with the newest plan, for observers."""
     state = session_state(session.session_id, session.running_world(), tuple(session.events))
     newest = session.newest_plan
     plan = plan_in_world(newest.plan, newest.motion) if newest is not None else None
