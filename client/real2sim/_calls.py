@@ -32,7 +32,7 @@ from .observation import View, view_from_frames
 RETRYABLE_STATUS = frozenset({408, 429, 502, 503, 504})
 
 RETRYABLE_CODES = frozenset(code.value for code in RETRYABLE)
-"""Codes of this package's protocol that pass, whatever their status."""
+"""Protocol error codes that are temporary, regardless of the HTTP status."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class RetryPolicy:
         retries: retries after the first try; 0 disables them.
         first_delay: seconds before the first retry; doubles with each.
         longest_delay: maximum back-off in seconds.
-        longest_wait_asked: seconds; a longer ``Retry-After`` ends the retries.
+        longest_wait_asked: longest accepted ``Retry-After`` in seconds; longer ones end retries.
     """
 
     retries: int = 2
@@ -89,14 +89,14 @@ def parse_retry_after(value: str | None, *, now: float | None = None) -> float |
 # Models between clients and workers of different versions.
 #
 # Requests only contain members that the caller has set, so that an older worker receives nothing
-# unknown and a newer worker applies its own defaults. Unknown members of replies are ignored, also
-# in models for which a worker is strict.
+# unknown and a newer worker applies its defaults. Unknown members of replies are ignored, even in
+# models that the worker parses strictly.
 
 M = TypeVar("M", bound=BaseModel)
 T = TypeVar("T")
 
 _UNKNOWN_VALUES = frozenset({"literal_error", "union_tag_invalid"})
-"""Kinds of errors of values that a newer worker may have more of."""
+"""Validation errors caused by values that only a newer worker knows."""
 
 
 def sent_fields(model: BaseModel) -> dict[str, Any]:
@@ -113,7 +113,7 @@ def sent_fields(model: BaseModel) -> dict[str, Any]:
 
 
 def read_fields(messages: TypeAdapter[T], fields: Mapping[str, Any]) -> T:
-    """A worker's message; members that are not known here are ignored. Raises ValidationError."""
+    """Parse a worker's message, ignoring unknown members. Raises ValidationError."""
     return messages.validate_python(fields, extra="ignore")
 
 
@@ -132,7 +132,7 @@ def read_json(model: type[M], content: bytes) -> M:
         if any(problem["type"] not in _UNKNOWN_VALUES for problem in problems):
             raise
         fields = json.loads(content)
-        # From the end of lists, so that earlier indices stay valid.
+        # Remove from the end of lists, so that earlier indices stay valid.
         for problem in reversed(problems):
             _leave_out(fields, problem["loc"])
         return model.model_validate(fields, extra="ignore")
@@ -149,13 +149,13 @@ def _sent(value: Any) -> Any:
 
 
 def _says(field: Any) -> bool:
-    """Whether None is something else than the default of a member."""
+    """Whether None differs from the default of a member."""
     return field.is_required() or field.get_default(call_default_factory=True) is not None
 
 
 @functools.cache
 def _constants(model: type[BaseModel]) -> frozenset[str]:
-    """Members that have one value only."""
+    """Members with only one possible value."""
     return frozenset(
         name
         for name, field in model.model_fields.items()
@@ -197,7 +197,7 @@ class Reply:
 
 
 def error_from_reply(reply: Reply) -> Real2SimError:
-    """The exception for an answer of status 400 or above, problem document or not."""
+    """The exception for a reply with status 400 or above, with or without a problem document."""
     try:
         problem = json.loads(reply.content)
     except ValueError:
@@ -252,7 +252,7 @@ def nothing(_reply: Reply) -> None:
 
 
 def model_of(model: type[M], *, whole: bool = False) -> Callable[[Reply], M]:
-    """A parser of answers; ``whole`` keeps unknown members, for models that are sent back later."""
+    """A parser of replies; ``whole`` keeps unknown members, for models that are sent back later."""
 
     def parse(reply: Reply) -> M:
         try:
@@ -325,9 +325,9 @@ def _wire_cloud(value: Any) -> WireCloud:
 
 
 def describe(error: ValidationError, model: type[BaseModel] | None = None) -> str:
-    """The errors in one line: ``sensors/0/width: input should be ...``.
+    """Up to four errors in one line: ``sensors/0/width: input should be ...``.
 
-    For an unknown member of the model it suggests the right name.
+    For an unknown member of the model, suggests a valid name.
     """
     members = list(model.model_fields) if model else []
     problems = []
@@ -348,7 +348,7 @@ def describe(error: ValidationError, model: type[BaseModel] | None = None) -> st
 
 @dataclass(frozen=True)
 class Request:
-    """A request. ``idempotent`` requests may be repeated when no reply arrived."""
+    """A request. ``idempotent`` requests may be repeated if no reply arrives."""
 
     method: str
     path: str
@@ -388,7 +388,7 @@ def checked(model: type[M], /, **fields: Any) -> M:
     """A model with these fields.
 
     Raises:
-        ValueError: names every invalid field, and the reason.
+        ValueError: lists up to four invalid fields with the reasons.
     """
     try:
         return model(**fields)
@@ -400,7 +400,7 @@ def instant_us(t: float | None, t_us: float | None) -> int | None:
     """A time given in seconds or in microseconds, in microseconds; None if neither is given.
 
     Raises:
-        ValueError: both are given, or it is not a whole number of microseconds.
+        ValueError: both are given, or ``t_us`` is not a whole number.
     """
     if t is not None and t_us is not None:
         raise ValueError(f"t={t!r} (seconds) and t_us={t_us!r} (microseconds); give one of them")
@@ -412,7 +412,7 @@ def instant_us(t: float | None, t_us: float | None) -> int | None:
 
 
 def new_key() -> str:
-    """An Idempotency-Key: made once a call, the same for all its tries."""
+    """A new Idempotency-Key; all attempts of a call share one key."""
     return uuid.uuid4().hex
 
 
@@ -443,7 +443,7 @@ def file_put(path: str, content: bytes, media_type: str, *, if_match: str) -> Re
 def upload(path: str, file: Path, form: dict[str, str]) -> Request:
     """A POST of a file with form fields."""
     key = new_key()
-    # The boundary derives from the key, so that every try sends the same bytes.
+    # The boundary derives from the key, so that every attempt sends the same bytes.
     headers = {
         "Idempotency-Key": key,
         "Content-Type": f"multipart/form-data; boundary=real2sim-{key}",
@@ -452,7 +452,7 @@ def upload(path: str, file: Path, form: dict[str, str]) -> Request:
 
 
 def json_of(body: BaseModel) -> bytes:
-    """The set fields of the model as JSON."""
+    """The fields set in a model, as JSON."""
     return json.dumps(sent_fields(body), allow_nan=False, separators=(",", ":")).encode()
 
 
@@ -469,7 +469,7 @@ def bearer(token: str | None) -> dict[str, str]:
 
 
 def image(path: str, view: ViewRequest) -> Call[Image]:
-    """A picture. Raises ValueError for an unknown codec."""
+    """An image request. Raises ValueError for an unknown codec."""
     if view.codec not in MEDIA_TYPES:
         allowed = ", ".join(("auto", *MEDIA_TYPES))
         raise ValueError(f"codec {view.codec!r} is unknown; allowed are {allowed}")

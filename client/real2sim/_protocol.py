@@ -103,7 +103,7 @@ class PendingRequest(Generic[A]):
     has_images: bool = False
 
     def encoded(self, slot: int | None = None) -> bytes:
-        """Its bytes; ``slot``: of shared memory, for images of the answer."""
+        """The encoded message; ``slot`` is the shared memory slot for images of the answer."""
         return encode({**self.fields} if slot is None else {**self.fields, "slot": slot})
 
 
@@ -170,7 +170,7 @@ class ProtocolState:
         return self._request_for(message, Obs, f"observation {self._step + 1}", has_images=True)
 
     def edit(self, operations: Sequence[Operation | Mapping[str, Any]]) -> PendingRequest[Edited]:
-        """Changes the session's world, on the revision seen last."""
+        """Changes the session's world, based on the last known revision."""
         message = checked(
             Edit, id=self._next_id(), base_rev=self._revision, operations=list(operations)
         )
@@ -203,7 +203,7 @@ class ProtocolState:
         return self._request_for(message, Driven, "confirmation of the object's plan")
 
     def snapshot(self, name: str) -> PendingRequest[Kept]:
-        """Keeps the present instant."""
+        """Saves the current state under a name."""
         message = checked(Snapshot, id=self._next_id(), name=name)
         return self._request_for(message, Kept, "confirmation of the snapshot")
 
@@ -215,7 +215,7 @@ class ProtocolState:
         )
 
     def fork(self) -> PendingRequest[Forked]:
-        """Makes another session at the same instant."""
+        """Creates another session from the current state."""
         return self._request_for(Fork(id=self._next_id()), Forked, "a fork", idempotent=False)
 
     def bye(self) -> PendingRequest[Result]:
@@ -225,7 +225,7 @@ class ProtocolState:
         )
 
     def read(self, data: bytes | str, request: PendingRequest[A]) -> A | None:
-        """The answer in ``data``; None if it is progress, or late for an older request.
+        """The answer in ``data``; None for progress and for late answers to older requests.
 
         Raises:
             StatusError: the worker refuses the message.
@@ -255,7 +255,7 @@ class ProtocolState:
         return message
 
     def take_unsolicited(self, *, newest: bool = False) -> Obs | None:
-        """An observation that came unsolicited: the oldest, or the newest and forget all others."""
+        """The oldest unsolicited observation; ``newest`` takes the newest and drops the others."""
         if not self._unsolicited:
             return None
         message = self._unsolicited.pop() if newest else self._unsolicited.popleft()
@@ -268,7 +268,7 @@ class ProtocolState:
         """Process a message while no answer is pending.
 
         Raises:
-            StatusError: the worker ends the connection; has the reason.
+            StatusError: the worker ends the connection, for the reason in the error.
         """
         message = server_message(data, SERVER_MESSAGE)
         if isinstance(message, Error):
@@ -302,7 +302,7 @@ def valid_plan(plan: Plan | Mapping[str, Any]) -> Plan:
         ValueError: describes the invalid field in one sentence.
     """
     if isinstance(plan, Mapping) and "kind" not in plan:
-        # The members determine the kind: no two kinds share a required member.
+        # The members identify the kind, because no two kinds share a required member.
         models: tuple[type[BaseModel], ...] = (TrajectoryPlan, Control, PoseCommand)
         kinds = [m for m in models if _required(m) <= set(plan)]
         if not kinds:
@@ -369,11 +369,11 @@ def error_of(message: Error) -> Exception:
     )
 
 
-# Opening and losing the socket, for the sync and the async client.
+# Opening and loss of the socket, for the sync and the async client.
 
 
 def socket_options(target: Target, session_id: str) -> dict[str, Any]:
-    """Arguments of a connection: no compression, large frames, time limits on."""
+    """Arguments for opening the socket: no compression, large messages, and timeouts."""
     return {
         "uri": target.drive_url(session_id),
         "subprotocols": [DRIVE_SUBPROTOCOL],
@@ -424,7 +424,7 @@ def handshake_errors(target: Target) -> Iterator[None]:
 
 @contextlib.contextmanager
 def lost_connection(target: Target, awaited: str) -> Iterator[None]:
-    """A socket that closes while an answer is awaited, as ConnectionLostError."""
+    """Raise ConnectionLostError if the socket closes while an answer is awaited."""
     try:
         yield
     except websockets.exceptions.ConnectionClosed as error:

@@ -131,13 +131,13 @@ class SharedFrames:
         self._lent: int | None = None
 
     def lend(self) -> int | None:
-        """The slot for images of the answer to the next message; None where all are looked at."""
+        """The slot for images of the next answer, or None if the caller still holds all slots."""
         if self._lent is None and self._free:
             self._lent = self._free.pop()
         return self._lent
 
     def pixels_of(self, frames: Sequence[Frame]) -> list[memoryview | None]:
-        """Pixels of an answer's images in its slot; None for each image sent over the socket.
+        """Pixels of an answer's images in shared memory; None for each image sent over the socket.
 
         Raises:
             MalformedReplyError: an image outside the slot.
@@ -158,7 +158,7 @@ class SharedFrames:
 
 
 def _part(slot: memoryview, frame: Frame, begin: int) -> memoryview | None:
-    """The bytes of a frame in the slot, whose image part starts at ``begin``."""
+    """The bytes of a frame in a slot that starts at offset ``begin`` of the shared memory."""
     if frame.offset is None:
         return None
     first = frame.offset - begin
@@ -171,7 +171,11 @@ def _part(slot: memoryview, frame: Frame, begin: int) -> memoryview | None:
 
 
 def _mapped(path: Path, size: int) -> mmap.mmap:
-    """The first ``size`` bytes of a worker's file, to be read. Raises OSError: it is none."""
+    """Map the first ``size`` bytes of a worker's shared memory file, read-only.
+
+    Raises:
+        OSError: the file is missing, too small or not shared memory of a worker.
+    """
     flags = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0)
     file = os.open(path, flags)
     try:
@@ -189,33 +193,39 @@ def _mapped(path: Path, size: int) -> mmap.mmap:
 
 
 LOST_ERRORS = (ConnectionLostError, SessionElsewhereError, GatewayError)
-"""After these a session is connected to anew: its worker is gone, or has lost it to another one."""
+"""Errors after which a session reconnects: its worker is gone, or another worker took it over."""
 
 MAX_RECONNECTS = 10_000
 
 
 def backoff(attempt: int) -> float:
-    """Seconds before try number ``attempt`` of a connection that was lost; with jitter."""
+    """Seconds to wait before reconnection attempt number ``attempt``, with jitter."""
     return min(0.05 * 2.0**attempt, 2.0) * (0.75 + 0.25 * random.random())
 
 
 def is_transient(error: Real2SimError) -> bool:
-    """Whether connecting to a worker that is being restarted may end so; a proxy before it answers
-    502 for a moment, once it is gone."""
+    """Whether connecting to a restarting worker can fail with this error.
+
+    A reverse proxy answers 502 for a moment after the worker has stopped.
+    """
     if isinstance(error, StatusError) and error.status in RETRYABLE_STATUS:
         return True
     return isinstance(error, UnreachableError | CapacityError | ReplyTimeoutError)
 
 
 def is_passing(error: Real2SimError) -> bool:
-    """Whether the worker has refused a message for now: its store is away, or the holder of the
-    token sends too much. The same message may be sent again."""
+    """Whether the worker refused a message only temporarily, so that it may be sent again.
+
+    For example, its store is unreachable, its queue is full, or the token has reached a limit.
+    """
     return is_away(error) or (isinstance(error, StatusError) and error.code in RETRYABLE_CODES)
 
 
 def is_away(error: Real2SimError) -> bool:
-    """Whether the request had no effect because the worker's store is unreachable, or because a
-    proxy finds no worker that accepts new requests."""
+    """Whether the request had no effect because the store or the worker was unavailable.
+
+    The worker's store is unreachable, or a proxy finds no worker that accepts new requests.
+    """
     if not isinstance(error, StatusError):
         return False
     return error.code == ErrorCode.STORAGE_UNAVAILABLE or (
@@ -288,7 +298,7 @@ class SessionBase(Handle):
         """The worker's welcome message: cameras, objects, time range, limits, versions.
 
         Raises:
-            NotOpenError: the session was not opened yet.
+            NotOpenError: the session has not been opened yet.
         """
         if self._welcome is None:
             raise not_open()
@@ -308,7 +318,7 @@ class SessionBase(Handle):
 
     @property
     def cameras(self) -> list[str]:
-        """Names of the cameras that can be sensors."""
+        """Names of the cameras available as sensors."""
         return [camera.name for camera in self.welcome.cameras]
 
     @property
@@ -328,10 +338,10 @@ class SessionBase(Handle):
         )
 
     def _offered_memory(self) -> SharedFrames | None:
-        """The memory that the welcome offers, open; None where it is not to be had or not wanted.
+        """The shared memory offered by the welcome, opened; None if unavailable or disabled.
 
         Raises:
-            UnreachableError: it is not to be had, and the session must have it.
+            UnreachableError: shared memory is required but unavailable.
         """
         offer = self.welcome.shared_memory
         if self._uses_shared_memory is False or self._plan.role != "controller":
@@ -360,25 +370,25 @@ class SessionBase(Handle):
         return self._target.shared_memory if own is None else own
 
     def _use_memory(self, memory: SharedFrames | None) -> None:
-        """Read images from there from now on."""
+        """Read images from ``memory`` from now on; None reads them from the socket."""
         self._memory = memory
         near = memory is not None and self._plan.codec == "auto"
         self._codec = "raw" if near else self._target.codec(self._plan.codec)
 
     def _slot_for(self, request: PendingRequest[Any]) -> int | None:
-        """Where images of the answer may be written."""
+        """Shared memory slot for images of the answer, or None."""
         return self._memory.lend() if self._memory and request.has_images else None
 
     def _pixels_of(self, frames: Sequence[Frame]) -> Sequence[memoryview | None]:
-        """Pixels of an answer's images that are in shared memory, else None."""
+        """Pixels of an answer's images in shared memory, with None for all others."""
         return () if self._memory is None else self._memory.pixels_of(frames)
 
     def _may_resend(self, request: PendingRequest[Any]) -> bool:
-        """Whether it is worth connecting again for the sake of a request."""
+        """Whether to reconnect and send the request again."""
         return self._welcome is not None and self._plan.reconnect > 0 and request.idempotent
 
     def _check_not_applied(self, request: PendingRequest[Any]) -> None:
-        """Raises ConnectionLostError when the request may have taken effect already."""
+        """Raises ConnectionLostError if the request may already have taken effect."""
         expected, revision = request.only_at_revision, self.welcome.revision
         if expected is not None and revision != expected:
             raise ConnectionLostError(
@@ -399,7 +409,7 @@ class SessionBase(Handle):
 
 
 def not_open() -> NotOpenError:
-    """The error of a session that is used before it is opened, or after it was closed."""
+    """The error for using a session before it is opened or after it is closed."""
     return NotOpenError(
         "the session is not open",
         hint="write `with client.session(...) as session:`, or call open() first and close() last; "
@@ -408,7 +418,7 @@ def not_open() -> NotOpenError:
 
 
 class SessionTokens:
-    """Tokens of the sessions that a client created; the worker gives them only once."""
+    """Tokens of the sessions that a client created. The worker sends each token only once."""
 
     def __init__(self, own: str | None) -> None:
         self._own = own
@@ -422,5 +432,5 @@ class SessionTokens:
         self._tokens.pop(session_id, None)
 
     def of(self, session_id: str) -> str | None:
-        """The token to send: the worker's own, which opens every session, else the session's."""
+        """The token to send: the worker token, which opens every session, or the session token."""
         return self._own or self._tokens.get(session_id)

@@ -1,6 +1,6 @@
 """Drive sessions: over a socket in lockstep, or over REST.
 
-A session is used by one thread or task at a time.
+Use a session from one thread or task at a time.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ class AsyncSessions(AsyncCollection[SessionInfo]):
         """Create a session and start its episode.
 
         Args:
-            scene, scenario: exactly one of them, or its name or id.
+            scene, scenario: exactly one of them, as an object, name or id.
             sensors: as in ``DriveSession.reset``.
             options: as in ``DriveSession.reset``.
 
@@ -137,7 +137,7 @@ class AsyncSessions(AsyncCollection[SessionInfo]):
     async def step(
         self, session_id: str, *, n: int = 1, plan: Plan | Mapping[str, Any] | None = None
     ) -> SessionState:
-        """Run ``n`` clock steps under one plan; default: the last plan, else along the log.
+        """Run ``n`` clock steps under one plan; default: the last plan, or else the recorded drive.
 
         Examples:
             >>> state = await client.sessions.step(info.session_id, n=5)
@@ -256,7 +256,7 @@ A = TypeVar("A", bound=Envelope)
 
 
 class AsyncDriveSession(SessionBase):
-    """A session in lockstep; made by :meth:`AsyncClient.session`.
+    """A session in lockstep, created by :meth:`AsyncClient.session`.
 
     Examples:
         >>> client = real2sim.connect_async()
@@ -275,7 +275,7 @@ class AsyncDriveSession(SessionBase):
         self._socket_stack = contextlib.AsyncExitStack()
 
     async def open(self) -> Self:
-        """Create or join the session and shake hands; returns once the scene is loaded.
+        """Create or join the session, and return once the scene is loaded.
 
         Raises:
             UnreachableError: no worker responds.
@@ -538,7 +538,7 @@ class AsyncDriveSession(SessionBase):
         return await outlast(partial(self._sent, request), seconds=seconds, passes=is_passing)
 
     async def _sent(self, request: PendingRequest[A]) -> A:
-        """The answer to a request, over a new connection where the old one is lost."""
+        """The answer to a request; reconnects if the connection is lost."""
         try:
             return await self._exchange(request)
         except LOST_ERRORS:
@@ -582,7 +582,7 @@ class AsyncDriveSession(SessionBase):
         await self._attach()
 
     async def _attach(self) -> None:
-        """Open the memory that the welcome offers, and prove it by its secret."""
+        """Open the shared memory offered by the welcome, and confirm it with its secret."""
         memory = self._offered_memory()
         if memory is None:
             return
@@ -603,7 +603,7 @@ class AsyncDriveSession(SessionBase):
             await self._socket_stack.aclose()
 
     async def _release(self) -> None:
-        """Close the socket, and end a session that has not been ended over it."""
+        """Close the socket, and end the session over REST if the socket could not end it."""
         await self._close_socket()
         self._socket = self._memory = None
         if self._info is not None and self._result is None:

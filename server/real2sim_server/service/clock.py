@@ -21,9 +21,9 @@ async def sleep_until(at: float) -> None:
 
 
 def now_us() -> int:
-    """Wall-clock time [us] since 1970 UTC; never less than before in this process.
+    """Wall-clock time [us] since 1970 UTC; never decreases within a process.
 
-    Rows of the store are listed in the order of these times, also when the clock is set back.
+    Rows of the store are listed in the order of these times, even when the clock is set back.
     """
     return _wall.read()
 

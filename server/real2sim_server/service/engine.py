@@ -32,7 +32,7 @@ class Priority(IntEnum):
     DRIVE = 0
     """Steps of sessions: a policy is waiting."""
     VIEW = 1
-    """Images for people, and any other job that takes milliseconds."""
+    """Images for interactive viewers, and other jobs that take milliseconds."""
     BULK = 2
     """Large images, videos, loading of scenes."""
 
@@ -45,7 +45,7 @@ class PriorityQueue(Generic[T]):
     """One first-in, first-out queue per priority, scheduled by weight.
 
     The next job comes from the priority with the least time per weight so far (stride scheduling,
-    Waldspurger & Weihl 1995). An idle priority gathers no credit. Not thread-safe.
+    Waldspurger & Weihl 1995). An idle priority accumulates no credit. Not thread-safe.
 
     Args:
         length: maximum number of waiting jobs per priority.
@@ -77,8 +77,10 @@ class PriorityQueue(Generic[T]):
         return self._begin(priority for priority in Priority if self._waiting[priority])
 
     def begin_more_urgent(self) -> T | None:
-        """Like :meth:`begin_next`, but only for priorities above the running job's that have not
-        used up their share."""
+        """Like :meth:`begin_next`, but only for higher priorities than that of the running job.
+
+        Skips priorities that have used up their share.
+        """
         present = self._running[-1]
         return self._begin(
             priority
@@ -162,8 +164,8 @@ IDLE_TICK_S = 0.25
 NICENESS = 3
 """Niceness of the engine thread. Kernels use every core; the event loop must be scheduled first."""
 SWITCH_INTERVAL_S = 0.0005
-"""How long a thread that runs Python code blocks the event loop at most [s]. Python's default is
-0.005."""
+"""Maximum time for which a thread that runs Python code blocks the event loop [s]. Python's default
+is 0.005."""
 
 log = structlog.get_logger(__name__)
 
@@ -212,7 +214,7 @@ class _EngineJob:
 
 
 class Engine:
-    """Runs jobs one after another on its own thread.
+    """Runs jobs one after another on a dedicated thread.
 
     All computation runs here, so kernels never compete for cores and the event loop never waits for
     them. A job is a plain function; its exceptions are raised in the caller. Jobs are scheduled as
@@ -256,7 +258,7 @@ class Engine:
         self._failure: BaseException | None = None
         self._thread = threading.Thread(target=self._work, name=name, daemon=True)
 
-    # --- life -------------------------------------------------------------------------------
+    # --- lifecycle --------------------------------------------------------------------------
 
     def start(self) -> None:
         """Start the thread and set the thread counts of torch and numba."""
@@ -283,7 +285,7 @@ class Engine:
             if self._thread.is_alive():
                 raise TimeoutError(f"job {self._running!r} still runs after {timeout_s:g} s")
 
-    # --- work -------------------------------------------------------------------------------
+    # --- jobs -------------------------------------------------------------------------------
 
     async def call(
         self,
@@ -351,7 +353,9 @@ class Engine:
         timeout_s: float | None = None,
         **kwargs: Any,
     ) -> T:
-        """Like :meth:`call`, for callers without an event loop. On the engine thread, runs at once.
+        """Like :meth:`call`, for callers without an event loop.
+
+        Runs ``fn`` immediately if called on the engine thread.
 
         Raises:
             TimeoutError: no result after ``timeout_s``.
@@ -399,7 +403,7 @@ class Engine:
 
     @property
     def seconds_since_tick(self) -> float:
-        """Time since the thread last polled the queue; grows while a job runs [s]."""
+        """Time since the thread last polled the queue [s]; grows while a job runs."""
         return clock.monotonic() - self._last_tick
 
     @property
@@ -414,7 +418,7 @@ class Engine:
         """Label of the running job, or None."""
         return self._running
 
-    # --- inside -----------------------------------------------------------------------------
+    # --- internals --------------------------------------------------------------------------
 
     async def _outcome(self, job: _EngineJob) -> Any:
         try:
@@ -586,7 +590,7 @@ def lower_priority(niceness: int) -> None:
     if sys.platform == "linux":
         thread = threading.get_native_id()
         if os.getpriority(os.PRIO_PROCESS, thread) < niceness:
-            # A sandbox may forbid it; the niceness then stays as it is.
+            # A sandbox may forbid this; the niceness then stays unchanged.
             with contextlib.suppress(OSError):
                 os.setpriority(os.PRIO_PROCESS, thread, niceness)
 

@@ -179,7 +179,7 @@ def tracker_of(
 ) -> ControlledTracker | GearedTracker | PerfectTracker:
     """The tracker of a spec, for a vehicle in ``motion`` at ``start_us``.
 
-    ``before``: the pose of the previous plan, for plans of a single pose.
+    ``before`` is the pose of the previous plan, for plans of a single pose.
     """
     if spec.tracker != "perfect" and can_reverse(spec):
         legs = legs_of(trajectory, motion, before)
@@ -215,7 +215,7 @@ def _geared(
 def make_tracker(
     reference: ReferenceTrajectory, spec: EgoSpec
 ) -> ControlledTracker | PerfectTracker:
-    """The tracker of a spec, for a plan that leads forwards."""
+    """The tracker of a spec, for a plan without reverse driving."""
     if spec.tracker == "perfect":
         return PerfectTracker(reference, spec)
     return ControlledTracker(KINDS[spec.tracker], reference, spec)
@@ -278,13 +278,13 @@ class ConstantCommand:
         return self.gear == "reverse" if self.gear is not None else motion.reversing
 
     def looped(self, loop: LoopTransform) -> Self:
-        """Returns itself: a command is independent of the position."""
+        """Returns itself, because a command does not depend on the position."""
         return self
 
 
 @dataclass(frozen=True)
 class Teleport:
-    """Places the vehicle at a pose, where it stays."""
+    """Places the vehicle at a pose and keeps it there."""
 
     pose: Pose
     spec: EgoSpec
@@ -294,7 +294,7 @@ class Teleport:
         return teleported(motion, self.pose, self.spec, dt_us)
 
     def command(self, motion: Motion, t: float) -> Command:
-        """Brakes: a teleported vehicle has no controller."""
+        """A braking command, because a teleported vehicle has no controller."""
         return Command(-EMERGENCY_BRAKING, motion.steering)
 
     def looped(self, loop: LoopTransform) -> Self:
@@ -443,7 +443,7 @@ class EgoController:
                 assert_never(plan)
 
     def _follow_log(self, motion: Motion, t_us: int) -> Controller:
-        # Resampled evenly: some logs have poses milliseconds apart, whose differences are noise.
+        # Resample evenly: some logs have poses milliseconds apart, whose differences are noise.
         end_us = self.ego.end_us
         count = max(-(-(end_us - t_us) // LOG_SPACING_US), 1)
         times = np.linspace(t_us, max(end_us, t_us + 1), count + 1).astype(np.int64)[1:]

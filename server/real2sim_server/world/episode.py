@@ -149,7 +149,7 @@ def _check_sensor(scene: Scene, spec: ResetSpec, sensor: SensorSpec) -> None:
 # --- Beyond the log ------------------------------------------------------------------------------
 
 # An episode may outlast the recording (``beyond_log`` of its reset). The route then continues with
-# the final curvature of the recorded drive, which fades to zero. With ``loop``, an ego at the end
+# the final curvature of the recorded drive, which decays to zero. With ``loop``, an ego at the end
 # of the recorded drive is reset to its start with the same offset and heading error
 # (:class:`.path.LoopTransform`). Road users that follow the route move with it; all others stay.
 
@@ -157,7 +157,7 @@ BEND_FROM = 10.0
 """Length at the end of the recorded drive that determines the final curvature [m]."""
 
 SHARPEST_BEND = 0.05
-"""Maximum curvature to continue [1/m]; above, it is noise or a turn at a junction."""
+"""Maximum curvature of a continuation [1/m]; larger values are noise or turns at junctions."""
 
 BEND_FADES = 40.0
 """Distance over which the curvature falls to 1/e [m]."""
@@ -217,7 +217,7 @@ def continued(path: LoggedPath, reach: float, ground: Ground) -> LoggedPath:
     bend = min(max(bend, -SHARPEST_BEND), SHARPEST_BEND)
     way = SPACING * np.arange(1, round(min(reach, FADED) / SPACING) + 1)
     yaws = path.yaws[-1] + bend * BEND_FADES * (1.0 - np.exp(-way / BEND_FADES))
-    # Along the chord of each piece, with the heading at its middle.
+    # Each piece follows its chord, with the heading at its middle.
     middles = np.concatenate([[path.yaws[-1]], yaws])
     chords = SPACING * np.exp(0.5j * (middles[1:] + middles[:-1]))
     plane = path.positions[-1, 0] + 1j * path.positions[-1, 1] + np.cumsum(chords)
@@ -282,7 +282,7 @@ def tracks_beyond_log(
 
 
 def _from_us(subject: ObjectState, start_us: int) -> int:
-    """Objects placed by an edit exist from the edit's time on."""
+    """Time from which an object exists [us]; one placed by an edit exists from the edit on."""
     return subject.trajectory.start_us if subject.edited else start_us
 
 
@@ -322,7 +322,7 @@ class LoopReset(NamedTuple):
 
     Attributes:
         laps: number of completed laps.
-        way: total length of these laps [m].
+        way: total length of the completed laps [m].
         motion, point: motion of the ego after the reset, and its route position.
         loop: transform from before to after the reset.
     """
@@ -471,7 +471,7 @@ class RandomizedIdm:
 
 
 class EstimateError(NamedTuple):
-    """Error of the ego's estimate of its own state: [m], [m], [rad], [m/s]."""
+    """Error of the ego's state estimate: x [m], y [m], yaw [rad], speed [m/s]."""
 
     x: float
     y: float

@@ -237,7 +237,7 @@ class World:
         """Run the first half of a step, which updates everything visible in images.
 
         :meth:`evaluate` must follow. Edits made since the last step are already in effect. In a
-        loop, an ego at the end of the route is reset to its start. Then the ego and the objects
+        loop, an ego at the end of the route is reset to the start. Then the ego and the objects
         move, and contacts are resolved.
 
         Args:
@@ -462,7 +462,7 @@ class World:
             )
 
     def _with_plan(self, plan: Plan | None, latency_us: int, jitter_us: int) -> EgoController:
-        """The controller with the policy's plan, which takes effect after its latency."""
+        """The controller with the policy's plan, which takes effect after the latency."""
         if plan is None:
             return self._controller
         from_us = takes_effect_us(
@@ -513,7 +513,7 @@ class World:
         return [Event("agents_react", self.t_us, data={"distance": distance})]
 
     def _advance(self, controller: EgoController) -> StepMotion:
-        """Objects, then the ego, one clock step later."""
+        """Advance the objects, then the ego, by one clock step."""
         t_us, before = self.t_us, self.agents
         end_us = t_us + self._clock.dt_us
         traffic = self.traffic.advance(self._tracks, end_us, lambda: self._surroundings(before))
@@ -588,7 +588,7 @@ class World:
     def _overlap_contacts(self, start: StepStart) -> StepContacts:
         """Contacts without collision response; the first may end the episode.
 
-        There are none while the ego replays the recording.
+        No contacts are reported while the ego replays the recording.
         """
         found = self._contacts.ego_contacts(start, self.T_world_vehicle, self.motion, self.agents)
         if self.t_us <= self._warm_up_end_us:
@@ -600,7 +600,7 @@ class World:
         return contacts
 
     def _departure_events(self) -> list[Event]:
-        """Events of an ego that leaves the corridor of the recorded path or the road."""
+        """Events of the ego leaving the road or the corridor of the recorded path."""
         events = []
         distance = math.dist(self._path_point.position[:2], (self.motion.x, self.motion.y))
         was_off_route, self._off_route = self._off_route, distance > OFF_ROUTE_DISTANCE
@@ -630,7 +630,7 @@ class World:
         self.reason = self.reason or "horizon"
         return [Event("horizon", self.t_us)]
 
-    # --- views of the instant ---------------------------------------------------------------
+    # --- views of the current state ---------------------------------------------------------
 
     def _first_motion(self, storyboard: StoryboardRun | None) -> tuple[Motion, dict[str, float]]:
         """The ego at the start, and the values sampled for it by name."""

@@ -38,11 +38,11 @@ if TYPE_CHECKING:
 
 SWEEP_S = 1.0
 MIN_BYTES_PER_S = 10_000
-"""Minimum rate; faster clients are never dropped for being slow."""
+"""Minimum transfer rate; clients at this rate or above are never dropped as slow."""
 NEAR, FAR = 0.8, 0.6
-"""Fractions of the limit: a warning is logged above the first, and re-armed below the second."""
+"""Fractions of the limit: a warning is logged above the first and re-armed below the second."""
 RESERVED_DESCRIPTORS = 256
-"""Reserved for the store, scene files, uploads and the pipes of jobs."""
+"""File descriptors reserved for the store, scene files, uploads and pipes of jobs."""
 MAX_CLIENTS_LOGGED = 5
 MAX_REASON_BYTES = 123
 HARMLESS = (
@@ -73,7 +73,7 @@ class ConnectionLimits:
     """Limits of connections.
 
     Attributes:
-        most: number of connections.
+        most: maximum number of connections.
         head_s: time from the first byte of a request, or from connecting, to the end of its
             headers.
         body_s: time for the body, in addition to that at the minimum rate.
@@ -122,13 +122,13 @@ class Connections:
         self._warn_when_near()
 
     def await_client(self, connection: Connection) -> None:
-        """It is the client's turn to send: the connection may be dropped for a new one."""
+        """Mark the client's turn to send: the connection may be dropped for a new one."""
         if connection in self._open:
             self._silent.pop(connection, None)
             self._silent[connection] = None
 
     def keep(self, connection: Connection) -> None:
-        """Protect the connection: it is the worker's turn, or a socket is in use."""
+        """Protect the connection while it is the worker's turn or a WebSocket is in use."""
         self._silent.pop(connection, None)
 
     def forget(self, connection: Connection) -> None:
@@ -160,7 +160,7 @@ class Connections:
             self._dropped_clients = []
 
     def _drop(self, connection: Connection, reason: DropReason) -> None:
-        # It counts as open until its end: a client that does not read holds it.
+        # It counts as open until it ends, because a client that does not read keeps it open.
         self._silent.pop(connection, None)
         if reason is DropReason.CROWDED_OUT:
             self._open.discard(connection)
@@ -268,8 +268,11 @@ class Connection(asyncio.Protocol):
         self._protocol, self._answering = protocol, True
 
     def may_write(self, data: bytes) -> bool:
-        """Whether uvicorn may write ``data``. It refuses bad requests and handshakes in plain text;
-        the client receives a problem document instead."""
+        """Whether uvicorn may write ``data``.
+
+        uvicorn refuses bad requests and handshakes in plain text. The client receives a problem
+        document instead.
+        """
         refusing = self._refused or data.startswith(b"HTTP/1.1 400 ")
         if self._answering or not refusing:
             return True
@@ -319,7 +322,7 @@ class Connection(asyncio.Protocol):
     async def serve_websocket(
         self, app: ASGIApp, scope: Scope, receive: Receive, send: Send
     ) -> None:
-        """Serve a WebSocket; from its first message on it is never dropped for a new connection."""
+        """Serve a WebSocket, which is not dropped for a new connection after its first message."""
         self._head_since, self._busy, self._answering = None, True, True
 
         async def receive_noted() -> Message:
@@ -366,7 +369,7 @@ class Connection(asyncio.Protocol):
 
 
 class _Transport:
-    """The transport for uvicorn's protocols; protocol changes keep the watch in place."""
+    """The transport for uvicorn's protocols; keeps the watch when the protocol changes."""
 
     def __init__(self, transport: asyncio.Transport, connection: Connection) -> None:
         self._transport = transport
@@ -382,7 +385,7 @@ class _Transport:
 
 
 def watch(config: uvicorn.Config, connections: Connections) -> None:
-    """Make ``connections`` watch the connections of uvicorn."""
+    """Watch all of uvicorn's connections with ``connections``."""
     logging.getLogger("uvicorn.error").addFilter(_is_news)
     config.app = _noted(config.app)  # type: ignore[arg-type]
     config.load()
@@ -473,7 +476,7 @@ def connection_limit(wanted: int) -> int:
     """Number of connections within the limit of file descriptors, at most ``wanted``."""
     try:
         import resource
-    except ImportError:  # not on this system
+    except ImportError:  # not available on this system
         return wanted
     soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
     if soft == resource.RLIM_INFINITY:
@@ -482,7 +485,7 @@ def connection_limit(wanted: int) -> int:
 
 
 def last_answer(reason: DropReason, limits: ConnectionLimits) -> bytes:
-    """A complete HTTP reply, after which the connection is closed."""
+    """The complete HTTP reply to send before the connection is closed."""
     failure = _FAILURES[reason](limits)
     problem = problem_of(failure, path="", request_id=None)
     body = json.dumps(problem.model_dump(mode="json", exclude_none=True)).encode()
@@ -539,9 +542,11 @@ _FAILURES = {
 
 
 def _send_unpaced(connection: socket.socket) -> None:
-    """Disable pacing by the congestion control on loopback: its timer runs for every 64 kB, which
-    adds 0.1 ms for three images."""
+    """Disable TCP pacing on loopback.
+
+    The pacing timer runs for every 64 kB, which adds 0.1 ms for three images.
+    """
     if hasattr(socket, "TCP_CONGESTION"):
-        # Reno is part of every Linux and open to every process.
+        # Every Linux kernel includes Reno, and every process may select it.
         with contextlib.suppress(OSError):
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_CONGESTION, b"reno")

@@ -64,9 +64,9 @@ Send = Callable[[EncodedMessage], Awaitable[None]]
 class DeadlineTimer:
     """Waits for the due action of one connected controller.
 
-    The time of a deadline runs from sending the observation to receiving the action; neither
-    computing nor a lost connection counts. Other sessions are not delayed: a fallback step waits in
-    the same queue as any step.
+    The deadline counts from sending the observation to receiving the action. It excludes
+    computation and lost connections. A fallback step waits in the same queue as any other step and
+    does not delay other sessions.
 
     Args:
         session: session of the controller.
@@ -84,7 +84,7 @@ class DeadlineTimer:
         self._sent_at = clock.monotonic()
 
     def start(self) -> None:
-        """An observation has been sent."""
+        """Start waiting: an observation has been sent."""
         self._sent_at = clock.monotonic()
         self.cancel()
         session = self._session
@@ -95,7 +95,7 @@ class DeadlineTimer:
             self._waiting = asyncio.create_task(self._wait(session.world.steps))
 
     def cancel(self) -> None:
-        """The action has arrived, or the controller has left."""
+        """Stop waiting: the action has arrived, or the controller has left."""
         if self._waiting is not None:
             self._waiting.cancel()
             self._waiting = None
@@ -189,7 +189,7 @@ class Connection:
         )
 
     async def serve(self, hello: Hello) -> None:
-        """Serve until either side leaves. A vanished client is not an error."""
+        """Serve until either side disconnects. A lost client is not an error."""
         session = self._session
         try:
             session.check_open()
@@ -252,7 +252,7 @@ class Connection:
                 session.controller = session.tell_controller = None
 
     async def end(self, error: ServiceError) -> None:
-        """Send the client the reason, and disconnect."""
+        """Send the reason to the client and disconnect."""
         await self._close_with_error(error)
 
     async def yield_control(self) -> None:
@@ -373,8 +373,10 @@ class Connection:
             return answer
 
     async def _until_let(self, action: Action) -> None:
-        """Wait for the clock; sends progress messages while it is held, so that clients do not time
-        out."""
+        """Wait until the clock lets the action pass.
+
+        Sends progress messages while the clock is held, so that clients do not time out.
+        """
         session = self._session
         while (wait_s := session.hold.wait_s) > 0 and session.lockstep.is_due(action.step):
             session.check_open()
@@ -385,7 +387,7 @@ class Connection:
             await session.hold.wait(min(wait_s, PROGRESS_S))
 
     def _check(self, action: Action, content: bytes) -> EncodedMessage | None:
-        """Whether this action is due; returns its answer if it was given before.
+        """The stored answer to a repeated action; None if the action is due.
 
         Raises:
             ServiceError: the session has ended, or the action is for another step.
@@ -394,7 +396,7 @@ class Connection:
         return self._session.lockstep.cached_answer(action.step, content)
 
     async def _change(self, message: Attach | Agent | Snapshot | Restore | Fork) -> EncodedMessage:
-        """Changes other than steps and edits; the caller holds the session's lock."""
+        """Apply a message other than a step or an edit. The caller holds the session's lock."""
         session, stepper = self._session, self._sessions.stepper
         match message:
             case Attach():
@@ -448,7 +450,7 @@ class Connection:
         """Read from the first message after the welcome whether the client has opened the memory.
 
         Raises:
-            ServiceError: INVALID_REQUEST, it claims so without the secret.
+            ServiceError: INVALID_REQUEST if the client confirms it with a wrong secret.
         """
         assert self._segment is not None
         try:
@@ -488,7 +490,7 @@ class Connection:
             await send(self._socket, message, message_id)
 
     async def _close_with_error(self, error: ServiceError, *, message_id: int = 0) -> None:
-        """Send the error and close; does not wait for a client that does not read."""
+        """Send the error and close, without waiting for a client that does not read."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(CLOSE_TIMEOUT_S), self._sending:
                 step = self._session.lockstep.step

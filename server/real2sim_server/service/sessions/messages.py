@@ -87,8 +87,10 @@ def read_message(data: bytes) -> ReceivedMessage:
 
 
 def action_in(data: bytes) -> ReceivedAction | None:
-    """Parse an action, the most frequent message; None for other or invalid messages. Values are
-    validated once: the model only has types that the protocol carries."""
+    """Parse an action, the most frequent message; None for other or invalid messages.
+
+    Values are validated once, because the model contains only types that the protocol carries.
+    """
     try:
         fields = unpack(data)
         if fields["type"] == "action" and type(fields["v"]) is int:
@@ -96,7 +98,7 @@ def action_in(data: bytes) -> ReceivedAction | None:
             if isinstance(message, Action):
                 return ReceivedAction(message, plan_payload(message.plan))
     except Exception:
-        # The general parser repeats the error, with an explanation.
+        # The general parser raises the same error with an explanation.
         return None
     return None
 
@@ -126,14 +128,14 @@ def _read(data: bytes) -> ClientMessage:
 
 
 def bad_message(detail: str) -> ServiceError:
-    """BAD_MESSAGE."""
+    """A BAD_MESSAGE error."""
     return ServiceError(
         ErrorCode.BAD_MESSAGE, detail, hint=f"messages are msgpack maps with a type: {TYPES}"
     )
 
 
 def unsupported_protocol(offered: list[str]) -> ServiceError:
-    """UNSUPPORTED_PROTOCOL, with the versions of both sides."""
+    """An UNSUPPORTED_PROTOCOL error with the versions of both sides."""
     return ServiceError(ErrorCode.UNSUPPORTED_PROTOCOL, protocol_mismatch(offered))
 
 
@@ -185,10 +187,10 @@ async def receive_hello(
     """Receive the hello of a client that may use a session.
 
     Args:
-        socket: accepted with our subprotocol.
-        row: row of the session.
-        authorised: whether the handshake had the worker's token.
-        opens_worker: whether a token is one of the worker's, which open every session.
+        socket: accepted with the drive subprotocol.
+        row: the session's row in the store.
+        authorised: whether the handshake carried the worker token.
+        opens_worker: returns whether a token is a worker token, which opens every session.
         resume_token: token of the session's controller.
 
     Raises:
@@ -250,7 +252,7 @@ async def send(socket: WebSocket, message: EncodedMessage, message_id: int = 0) 
 async def with_progress(
     socket: WebSocket, work: Coroutine[Any, Any, T], hello: Envelope, *, phase: str
 ) -> T:
-    """The result of ``work``; meanwhile the client receives progress of a ``phase``."""
+    """The result of ``work``; meanwhile, the client receives progress messages for ``phase``."""
     task = asyncio.create_task(work)
     # Retrieve the outcome even if the client has left.
     task.add_done_callback(lambda done: done.cancelled() or done.exception())
@@ -263,7 +265,7 @@ async def with_progress(
 async def close_with_error(
     socket: WebSocket, error: ServiceError, *, message_id: int = 0, step: int | None = None
 ) -> None:
-    """Send the error and close; does not wait for a client that does not read."""
+    """Send the error and close, without waiting for a client that does not read."""
     with contextlib.suppress(TimeoutError, WebSocketDisconnect, RuntimeError):
         async with asyncio.timeout(CLOSE_TIMEOUT_S):
             message = error_message(error, fatal=True, step=step)
@@ -274,7 +276,7 @@ async def close_with_error(
 def error_message(
     error: ServiceError, *, fatal: bool = False, step: int | None = None
 ) -> EncodedMessage:
-    """An error as a message; ``step`` is the due one."""
+    """An error as a message; ``step`` is the step that is due."""
     fields = {
         "code": error.code.value,
         "detail": error.detail,

@@ -9,15 +9,17 @@ phase         runs on         purpose
 ``render``    engine          deformations, then images and clouds of the due sensors
 ``evaluate``  worlds, during  metrics and events; write the log entry; pack the observation without
               rendering       its images
-``encode``    encoders        encode images, copy raw ones into shared memory; join the parts into
+``encode``    encoders        encode images or copy raw ones into shared memory; join the parts into
                               one message
 ``send``      event loop      write the message to the socket (`connection`)
 ============  ==============  ====================================================================
 
-A world without sensors advances on a separate thread: it needs no device, and its planner does not
-wait while other sessions are rendered. Steps that wait for a thread at the same time are processed
-as a batch: their log entries are one transaction, and if the backend supports it, their images are
-rendered in one pass, bit-identical to separate rendering. No step waits for later ones.
+A world without sensors needs no device. It advances on a separate thread, so that its planner does
+not wait while other sessions are rendered.
+
+Steps that wait for a thread at the same time are processed as a batch. Their log entries are
+written in one transaction. If the backend supports it, their images are rendered in one pass,
+bit-identical to separate rendering. No step waits for later ones.
 """
 
 from __future__ import annotations
@@ -53,11 +55,11 @@ WARM_UP_WIDTH = 320
 MAX_TOGETHER = 16
 """Maximum batch of steps without sensors: the first waits a few milliseconds for the last."""
 MAX_TOGETHER_DRAWN = 8
-"""The same for steps with images."""
+"""Maximum batch of steps with images."""
 MAX_PIXELS_TOGETHER = 16_000_000
-"""The same for their images."""
+"""Maximum number of pixels in a batch of steps with images."""
 MAX_WAITING = 1024
-"""Maximum number of steps waiting for the thread of worlds."""
+"""Maximum number of steps waiting for the world thread."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +70,7 @@ class LogWrite:
         store: the store.
         claim: the claim on the session.
         entries: the entries.
-        instead: whether they replace stored entries from there on.
+        instead: whether they replace all stored entries from the first one on.
     """
 
     store: Store
@@ -86,7 +88,7 @@ class EncodedObservation:
         frames: images of the message.
         message: complete message for all recipients.
         timing_ms: durations by stage.
-        placed: message for the answered client, if its images are in shared memory.
+        placed: message for the requesting client, if its images are in shared memory.
         clouds: point clouds of the message.
     """
 
@@ -99,7 +101,7 @@ class EncodedObservation:
 
     @property
     def answer(self) -> EncodedMessage:
-        """The message for the answered client."""
+        """The message for the requesting client."""
         return self.placed or self.message
 
 
@@ -121,7 +123,7 @@ class Step:
         images, measured: their results, in order.
         members: members of the message, without images, clouds and timing.
         recorded: whether ``log`` is written.
-        error: reason for a failure.
+        error: error of a failed step.
     """
 
     change: Callable[[], World]
@@ -197,7 +199,7 @@ class StepPipeline:
         self._worlds.start()
 
     def close(self) -> None:
-        """End its threads."""
+        """End the threads."""
         self._worlds.stop(drain=False)
         self._evaluators.shutdown(cancel_futures=True)
 
@@ -236,7 +238,7 @@ class StepPipeline:
         await self._renderer.ready(sensors, sizes, lambda: instances_at_start(scene, state))
 
     async def edit_ready(self, world: World, cameras: Mapping[str, Camera]) -> None:
-        """As :meth:`levels_ready` for an edited world, for its current and later objects."""
+        """Like :meth:`levels_ready`, for the current and later objects of an edited world."""
         sensors = world.spec.sensors
 
         def shown() -> list[Instance]:
@@ -247,10 +249,10 @@ class StepPipeline:
         await self._renderer.ready(sensors, [cameras[s.camera] for s in sensors], shown)
 
     def drawn_with(self, world: World, cameras: Mapping[str, Camera]) -> Scene | None:
-        """The scene whose sessions may share a rendering batch with the world's next step; None for
-        none.
+        """The scene whose sessions may share a rendering batch with the world's next step.
 
-        No session waits for the deformations of another.
+        None if the step cannot be batched, for example because its objects deform: other sessions
+        do not wait for deformations.
         """
         sensors = world.spec.sensors
         deforms = world.deformation is not None and world.deformation.has_impacts
@@ -260,7 +262,7 @@ class StepPipeline:
         return world.scene if self._renderer.draws_together(sensors, sizes) else None
 
     async def on_world_thread(self, fn: Callable[..., T], *args: Any) -> T:
-        """``fn(*args)`` on the thread that moves worlds without sensors."""
+        """``fn(*args)`` on the thread that advances worlds without sensors."""
         return await self._worlds.call(fn, *args, label="world", priority=Priority.DRIVE)
 
     # --- a change of the world ------------------------------------------------------------------
@@ -296,7 +298,9 @@ class StepPipeline:
 
     def compute(self, steps: Sequence[Step]) -> list[Exception | None]:
         """Advance, render and evaluate a batch of steps; returns the error of each, or None.
-        Failures do not affect the other steps."""
+
+        Failures do not affect the other steps.
+        """
         for step in steps:
             step.timer.stage("queue")
         self.advance(steps)
@@ -314,8 +318,10 @@ class StepPipeline:
         return [step.error for step in steps]
 
     def advance(self, steps: Sequence[Step]) -> None:
-        """Advance the worlds, except for parts that images do not show, and find the due
-        sensors."""
+        """Advance the worlds and find the due sensors.
+
+        Parts of a world that images do not show are left to :meth:`evaluate`.
+        """
         for step in steps:
             with step.catching():
                 world = step.world = step.world or step.change()
@@ -369,14 +375,16 @@ class StepPipeline:
         return observation
 
     def _draw(self, steps: Sequence[Step]) -> None:
-        """Render the images of a batch of steps; none of them if one fails."""
+        """Render the images of a batch of steps. If one fails, none has images."""
         requests = [(_request(s.moved, s.sensors), _cameras(s)) for s in steps]
         for step, images in zip(steps, self._renderer.render_together(requests), strict=True):
             step.images = _estimated(step.moved, images)
 
     def _require_kernels(self, world: World) -> None:
-        """Raises KernelsMissingError if images of a world would compile kernels on the engine,
-        which all sessions share."""
+        """Raises KernelsMissingError if rendering a world would compile kernels on the engine.
+
+        All sessions share the engine.
+        """
         shapes = world.deformation
         if shapes is not None and shapes.has_impacts and not self._deformation.ready:
             raise KernelsMissingError
@@ -391,12 +399,12 @@ class StepPipeline:
         ranging: RangingSensors = NO_SENSORS,
         slot: FrameSlot | None = None,
     ) -> EncodedObservation:
-        """Images and clouds of a committed step, from the vehicle; time does not advance.
+        """Images and clouds of a committed step, seen from the vehicle; time does not advance.
 
         Args:
             world: the world at that step.
             sensors: the cameras.
-            ranging: LiDARs and radars, all of them due.
+            ranging: LiDARs and radars, all due.
             slot: shared memory slot for raw images.
 
         Raises:
@@ -475,8 +483,10 @@ class StepPipeline:
 
 
 def record(steps: Sequence[Step]) -> None:
-    """Write the log entries of steps, if possible in one transaction; one failure does not affect
-    the others. Off the event loop."""
+    """Write the log entries of steps, if possible in one transaction.
+
+    Runs off the event loop. A failure affects only the step concerned.
+    """
     logs = [(step, step.log) for step in steps if step.log is not None]
     if len(logs) > 1 and not any(log.instead for _, log in logs):
         with contextlib.suppress(Exception):
@@ -532,7 +542,7 @@ def _cameras(step: Step) -> list[Camera]:
 
 
 def _estimated(world: World, images: Sequence[RenderedImage]) -> Sequence[RenderedImage]:
-    """Images from the true ego pose, labelled with poses of the ego's estimate."""
+    """Images from the true ego pose, labelled with the sensor poses of the ego's estimate."""
     if world.T_world_estimate is world.T_world_body:
         return images
     believed = []

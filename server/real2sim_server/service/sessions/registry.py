@@ -40,7 +40,7 @@ from .session import EpisodeStart, Session, session_info
 from .shared_memory import Segments
 from .step import Stepper
 
-# Recovery: rebuilds sessions of an earlier run of the worker from their logs.
+# Recovery: rebuild sessions of an earlier run of the worker from their logs.
 
 
 def entries_of(rows: Iterable[SessionEntry]) -> list[Entry]:
@@ -144,8 +144,10 @@ def _world(replayer: Replayer) -> World:
 
 
 def _content(entry: Entry) -> bytes:
-    """The bytes that identify an action: only its plan, encoded by this version. The version that
-    wrote the entry may have had fewer members."""
+    """The bytes that identify an action: its plan, encoded by this version.
+
+    The version that wrote the entry may have encoded fewer members.
+    """
     fields = decode(entry.payload)["plan"]
     return plan_payload(None if fields is None else PLAN.validate_python(fields))
 
@@ -166,8 +168,8 @@ class SessionLimits:
     Attributes:
         worker_id: first part of session ids.
         max_sessions: maximum number of open sessions.
-        idle_seconds: time without use and without connection after which a session leaves the
-            memory; a later request rebuilds it from its log.
+        idle_seconds: time without use or connection after which a session is evicted from memory;
+            a later request rebuilds it from its log.
     """
 
     worker_id: str
@@ -179,13 +181,13 @@ class Sessions:
     """All open sessions of a worker, for use on the event loop.
 
     Args:
-        limits: number and lifetime.
+        limits: maximum number and idle time of sessions.
         pipeline: renders sessions.
         kernels: kernels that episodes wait for.
         store: stores sessions and their logs before they take effect.
         scene_cache: holds their scenes in memory.
         scenarios: scenarios to start from.
-        metrics: receives their number.
+        metrics: receives the number of sessions.
         segments: shared memory for controllers on this machine.
         leases: sessions of each worker with the same store.
         accounts: accounts of the owners, with their limits.
@@ -241,12 +243,15 @@ class Sessions:
         return len(self._open) + self._in_creation.total() >= self._limits.max_sessions
 
     def owned(self) -> Counter[str]:
-        """Number of sessions by name of the owner's token, including those in creation."""
+        """Number of sessions by the name of the owner's token, including those being created."""
         return self._in_creation + Counter(s.row.owner for s in self._open.values())
 
     @asynccontextmanager
     async def running(self) -> AsyncIterator[Sessions]:
-        """Evict idle sessions during the block; open ones end with it."""
+        """Run the step pipeline and evict idle sessions during the block.
+
+        New sessions are refused after it.
+        """
         self.pipeline.start()
         evicting = asyncio.create_task(self._evict_idle(), name="idle-sessions")
         try:
@@ -258,7 +263,7 @@ class Sessions:
                 await evicting
             self.pipeline.close()
 
-    # --- life -------------------------------------------------------------------------------
+    # --- lifecycle --------------------------------------------------------------------------
 
     async def create(
         self,
@@ -278,8 +283,8 @@ class Sessions:
             ws_base: address of this worker for clients, for example ``ws://127.0.0.1:8600``.
 
         Raises:
-            ServiceError: OVER_CAPACITY or DRAINING; INVALID_REQUEST; or as for scene cache and
-                scenarios.
+            ServiceError: OVER_CAPACITY, DRAINING, INVALID_REQUEST, or an error of the scene cache
+                or the scenarios.
             WorldError: the episode cannot run with these options.
         """
         if (scene is None) == (scenario is None):
@@ -309,12 +314,13 @@ class Sessions:
         return info
 
     async def find(self, session_id: str) -> Session:
-        """The open session of that id; sessions of an earlier run or of a dead worker are rebuilt
-        first.
+        """The open session with this id.
+
+        Sessions of an earlier run or of a dead worker are rebuilt first.
 
         Raises:
             ServiceError: SESSION_CLOSED if it has ended, UNKNOWN_SESSION, SESSION_ELSEWHERE while
-                another worker has it, or an error of the rebuild.
+                another worker owns it, or an error of the rebuild.
         """
         if (session := self._open.get(session_id)) is not None:
             if session.log_unsure:
@@ -331,7 +337,7 @@ class Sessions:
         """
         if (session := self._open.get(session_id)) is not None:
             return session.row
-        # Ids of another format are not queried; the database may reject some of them.
+        # Do not query ids of another format, because the database may reject them.
         row = await self._store.session(session_id) if _ID.fullmatch(session_id) else None
         if row is None:
             hint = "GET /v1/sessions lists them"
@@ -397,7 +403,7 @@ class Sessions:
         """The world at a step, and the log up to it.
 
         Raises:
-            ServiceError: INVALID_REQUEST, the episode does not have the step.
+            ServiceError: INVALID_REQUEST if the episode does not have the step.
         """
         episode = last_episode(entries_of(rows))
 
@@ -426,7 +432,7 @@ class Sessions:
             if session.running_world().over:
                 return
             message = await self.stepper.stop(session, "stopped")
-            # An action that waits for the clock is refused after this, when the lock is released.
+            # An action that waits for the clock is refused once the lock is released.
             if session.tell_controller is not None:
                 with contextlib.suppress(Exception):
                     await session.tell_controller(message)
@@ -434,7 +440,7 @@ class Sessions:
 
     async def entries(self, session: Session) -> list[Entry]:
         """All entries of a session's log, oldest first."""
-        # A step in progress is already in the log; it may be withdrawn again.
+        # A step in progress is already in the log, but may still be withdrawn.
         end = session.next_seq
         rows = await self._store.session_entries(session.session_id)
         return entries_of(row for row in rows if row.seq < end)
@@ -460,7 +466,7 @@ class Sessions:
         return await self.pipeline.on_world_thread(score)
 
     async def close(self, session: Session, *, reason: str) -> None:
-        """End a session after its step in progress; idempotent."""
+        """End a session after the step in progress; idempotent."""
         if self._open.pop(session.session_id, None) is None:
             return
         session.closed = _closed(session.session_id, reason)
@@ -468,7 +474,7 @@ class Sessions:
             try:
                 await self._store.close_session(session.row.claim, reason=reason)
             except BaseException:
-                # It has not ended until the store says so.
+                # The session has not ended until the store confirms it.
                 session.closed = None
                 self._open[session.session_id] = session
                 raise
@@ -477,8 +483,10 @@ class Sessions:
         log.info("session closed", session_id=session.session_id, reason=reason)
 
     def let_go(self, session: Session) -> None:
-        """Drop a session that another worker has taken over, or may take over; its connections are
-        redirected. Idempotent."""
+        """Drop a session that another worker has taken over or may take over. Idempotent.
+
+        Its connections are redirected.
+        """
         if self._open.get(session.session_id) is not session:
             return
         del self._open[session.session_id]
@@ -488,13 +496,13 @@ class Sessions:
         log.warning("session left to another worker", session_id=session.session_id)
 
     def hand_over(self) -> None:
-        """Hand over all sessions to other workers, and accept none back; the logs are complete."""
+        """Hand over all sessions to other workers and accept no more. Their logs are complete."""
         self.draining = self._handed_over = True
         for session in list(self):
             self.let_go(session)
 
     async def let_go_of_lost(self) -> None:
-        """Drop all sessions that were taken over: other workers considered this one dead."""
+        """Drop all sessions that other workers took over because they considered this one dead."""
         epochs = await self._leases.epochs(list(self._open))
         for session in self:
             if epochs.get(session.session_id) != session.row.epoch:
@@ -521,14 +529,14 @@ class Sessions:
             self._warm.add(scene)
 
     def resume_token(self, row: SessionRow) -> str:
-        """Token to reconnect a controller; the same in every run, and not in the store."""
+        """Token to reconnect a controller. It is the same in every run and is not stored."""
         return hmac.new(self.resume_key, row.session_id.encode(), "sha256").hexdigest()
 
-    # --- inside -----------------------------------------------------------------------------
+    # --- internals --------------------------------------------------------------------------
 
     @contextlib.contextmanager
     def _reserved_slot(self, owner: str) -> Iterator[None]:
-        """Reserves a slot for a session in creation.
+        """Reserve a slot for a session that is being created.
 
         Raises:
             ServiceError: DRAINING or OVER_CAPACITY.
@@ -588,7 +596,7 @@ class Sessions:
         return session
 
     def _tell(self, session: Session, error: ServiceError) -> None:
-        """End a session's connections; not awaited, because clients may read slowly."""
+        """End a session's connections without waiting for them, because clients may read slowly."""
         for close in session.close_callbacks:
             closing = asyncio.ensure_future(close(error))
             self._closing.add(closing)
@@ -654,7 +662,7 @@ def check_not_closed(row: SessionRow) -> SessionRow:
 
 
 def elsewhere(session_id: str) -> ServiceError:
-    """SESSION_ELSEWHERE."""
+    """A SESSION_ELSEWHERE error."""
     return ServiceError(
         ErrorCode.SESSION_ELSEWHERE,
         f"session {session_id!r} is another worker's",

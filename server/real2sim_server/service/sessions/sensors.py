@@ -33,7 +33,7 @@ from ..render_background import BackgroundCompile
 from ..renderer import check_known, check_sensors
 
 MAX_IMAGE_BYTES = MAX_SERVER_MESSAGE_BYTES - 1024 * 1024
-"""Limit of raw images in one message; the remainder is for its other members."""
+"""Maximum size of raw images in one message [bytes]; the rest is for its other members."""
 
 
 def cameras_of(scene: Scene, sensors: Sequence[SensorSpec], *, max_pixels: int) -> list[Camera]:
@@ -61,7 +61,7 @@ def check_message_bytes(size: int) -> None:
 
 
 def raw_image_bytes(sensors: Sequence[SensorSpec], cameras: Iterable[Camera]) -> int:
-    """Size of the raw images of one step [bytes]; ``cameras``: those of the sensors, in order."""
+    """Size of the raw images of one step [bytes]; ``cameras`` has one camera per sensor."""
     return sum(
         modality_of(modality).raw_bytes(camera.width, camera.height)
         for camera, sensor in zip(cameras, sensors, strict=True)
@@ -77,8 +77,11 @@ POINT_BYTES = 40
 async def mount_sensors(
     lidars: Sequence[LidarSpec], radars: Sequence[RadarSpec], dt_us: int
 ) -> RangingSensors:
-    """As :func:`.mounted_sensors`, and prepares their rays, off the event loop and the engine.
-    Raises WorldError: INVALID_REQUEST."""
+    """Like :func:`.mounted_sensors`; also prepares the rays, off the event loop and the engine.
+
+    Raises:
+        WorldError: INVALID_REQUEST.
+    """
     if not lidars and not radars:
         return NO_SENSORS
 

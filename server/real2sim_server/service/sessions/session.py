@@ -72,7 +72,7 @@ class LockStep(Generic[A]):
         self.over = True
 
     def restore_answer(self, content: bytes, answer: A) -> None:
-        """Restore the answer to the last step, after a replay."""
+        """Restore the answer to the last step after a replay."""
         self._last = (content, answer)
 
     def cached_answer(self, step: int, content: bytes) -> A | None:
@@ -84,7 +84,7 @@ class LockStep(Generic[A]):
 
         Raises:
             ServiceError: NOT_RESET; STEP_CONFLICT if the step had another action;
-                STALE_STEP for older steps; EPISODE_OVER; BAD_STEP for newer steps.
+                STALE_STEP for older steps; BAD_STEP for newer steps; EPISODE_OVER.
         """
         if self.step is None:
             raise not_reset()
@@ -116,12 +116,12 @@ class LockStep(Generic[A]):
         return step == self.step and not self.over
 
     def advance(self, content: bytes, answer: A, *, over: bool) -> None:
-        """The due action was taken; stores ``answer`` until the next one."""
+        """Take the due action, and store ``answer`` until the next one."""
         self._move(1, over=over)
         self._last = (content, answer)
 
     def skip(self, steps: int, *, over: bool) -> None:
-        """The clock was advanced without an action; no answer is stored."""
+        """Advance without an action; no answer is stored."""
         self._move(steps, over=over)
         self._last = None
 
@@ -133,7 +133,7 @@ class LockStep(Generic[A]):
 
 
 def not_reset() -> ServiceError:
-    """NOT_RESET."""
+    """A NOT_RESET error."""
     return ServiceError(
         ErrorCode.NOT_RESET,
         "no episode has begun in this session",
@@ -152,8 +152,10 @@ def _repeated(step: int, content: bytes, taken: bytes, answer: A) -> A:
 
 
 class ClockHold:
-    """Gates actions: passes all, or a number of them, immediately or at a pace; others wait. For
-    use on the event loop."""
+    """Gates actions: lets all or a number of them pass, immediately or at a pace.
+
+    Other actions wait. For use on the event loop.
+    """
 
     def __init__(self) -> None:
         self._steps: int | None = None
@@ -209,7 +211,7 @@ KEPT = 4
 
 
 class ObserverQueue:
-    """A short queue of observations for one observer. Adding one never waits.
+    """A short queue of observations for one observer; adding one never waits.
 
     Attributes:
         dropped: number of observations dropped for a slow observer.
@@ -237,7 +239,7 @@ class ObserverQueue:
 
 
 CloseWithError = Callable[[ServiceError], Awaitable[None]]
-"""Ends a connection with the reason that its session has ended."""
+"""Ends a connection and sends the reason."""
 
 
 TellController = Callable[[EncodedMessage], Awaitable[None]]
@@ -249,7 +251,7 @@ class NewestPlan(NamedTuple):
     Attributes:
         plan: as sent.
         motion: motion in the observation that it answers.
-        took_us: time from the observation to the action [us].
+        took_us: wall-clock time from the observation to the action [us].
     """
 
     plan: Plan
@@ -288,18 +290,18 @@ class Session:
         next_seq: next entry of the session's log.
         log_unsure: whether the log may have entries from ``next_seq`` that never took effect,
             because the store did not report the outcome.
-        unsure_replies: keys of replies that may be stored likewise.
+        unsure_replies: keys of replies that may be stored although they never took effect.
         snapshots: saved states by name.
         newest: observation of the current step, if it has been computed.
-        late: whether the planner has missed the deadline of the due action, and the clock waits.
-        expires_at: monotonic time at which the episode is cut off [s]; None for never.
+        late: whether the planner has missed the deadline of the due action while the clock waits.
+        expires_at: monotonic time at which the episode is ended [s]; None for no limit.
         controller: the connection that drives, if any.
-        tell_controller: sends it an observation without an action.
+        tell_controller: sends the controller an observation that answers no action.
         hold: gates the clock.
         newest_plan: newest plan of the controller.
         observers: queues of the observers' connections.
         close_callbacks: one for each open connection.
-        closed: why the session has ended; None while it is open.
+        closed: reason for the end of the session; None while it is open.
     """
 
     row: SessionRow
@@ -352,7 +354,7 @@ class Session:
         return self.world.spec if self.world else ResetSpec()
 
     def begin(self, world: World, cameras: dict[str, Camera]) -> None:
-        """An episode begins."""
+        """Begin an episode."""
         self.world, self.cameras = world, cameras
         self.lockstep.reset()
         self.events, self.newest, self.late, self.newest_plan = [], None, False, None
@@ -392,7 +394,7 @@ def opens_session(token: str | None, row: SessionRow) -> bool:
 
 
 def controller_taken(session_id: str) -> ServiceError:
-    """CONTROLLER_TAKEN."""
+    """A CONTROLLER_TAKEN error."""
     return ServiceError(
         ErrorCode.CONTROLLER_TAKEN,
         f"session {session_id!r} has a controller on its drive socket",
@@ -446,7 +448,7 @@ def session_state(session_id: str, world: World, events: Iterable[Event]) -> Ses
 
 
 def shown_state(session: Session) -> SessionState:
-    """As :func:`session_state`, with the newest plan, for observers."""
+    """Like :func:`session_state`, with the newest plan, for observers."""
     state = session_state(session.session_id, session.running_world(), tuple(session.events))
     newest = session.newest_plan
     plan = plan_in_world(newest.plan, newest.motion) if newest is not None else None
@@ -504,8 +506,7 @@ def welcome_fields(session: Session, role: str) -> dict[str, Any]:
 
 
 def result_fields(world: World | None, scores: Sequence[Score]) -> dict[str, Any]:
-    """Members of the protocol's Result, without envelope; ``world``: the last one, if there is
-    one."""
+    """Members of the protocol's Result, without envelope; ``world`` is the last world, if any."""
     return {
         "steps": world.steps if world else 0,
         "t_us": world.t_us if world else None,

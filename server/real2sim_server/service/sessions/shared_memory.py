@@ -1,13 +1,13 @@
 """Images for a controller on the same machine, in a file that both processes map.
 
 The worker creates a file for each controller and names it in the welcome. A client that can open it
-returns the secret at its start. This proves that both see the same memory; with containers and
-tunnels an address would not. The name is then removed, so that the memory is free once worker and
-client have released it, however they end. A name only remains if a worker is killed before its
-client has answered; the next worker removes it.
+returns the secret at its start. This proves that both see the same memory; an address would not,
+because of containers and tunnels. The name is then removed, so that the memory is freed once worker
+and client have released it, even after a crash. A name remains only if a worker is killed before
+its client has answered. The next worker then removes it.
 
-Each message names the slot for the images of its answer, and the worker writes to no other slot and
-at no other time. An image therefore stays unchanged as long as its client does not reuse the slot.
+Each message names the slot for the images of its answer. The worker writes only to that slot, and
+only for that answer. An image therefore stays unchanged until the client reuses the slot.
 """
 
 from __future__ import annotations
@@ -44,25 +44,27 @@ SLOTS = 4
 PREFIX = "real2sim-"
 NAME_BYTES = 16
 READ_ONLY = 0o400
-"""Read-only for our user, so that no client truncates the file by mistake."""
+"""Read-only for the worker's user, so that no client truncates the file by mistake."""
 
 log = structlog.get_logger(__name__)
 
 
 class Segment:
-    """The shared memory of one controller. Images are placed on any thread, one answer at a time;
-    all other methods are for the event loop.
+    """The shared memory of one controller.
+
+    :meth:`place` may run on any thread, for one answer at a time. All other methods are for the
+    event loop.
 
     Args:
         path: path of the new file.
         slot_bytes: size of each slot; memory is only allocated when images need it.
-        budget: memory budget that counts it.
+        budget: memory budget that includes it.
 
     Attributes:
-        attached: whether the client has proved that it has opened the memory.
+        attached: whether the client has confirmed with the secret that it has opened the memory.
 
     Raises:
-        OSError: shared memory is not available here.
+        OSError: shared memory is not available on this machine.
     """
 
     def __init__(self, path: Path, slot_bytes: int, budget: MemoryBudget) -> None:
@@ -82,7 +84,7 @@ class Segment:
             size = SHM_HEADER_BYTES + SLOTS * slot_bytes
             os.ftruncate(self._file, size)
             os.posix_fallocate(self._file, 0, SHM_HEADER_BYTES)
-            # Unmapped with the last array that uses it, possibly on another thread.
+            # The memory is unmapped with the last array that uses it, possibly on another thread.
             self._memory = np.frombuffer(mmap.mmap(self._file, size), np.uint8)
         except BaseException:
             self.close()
@@ -106,7 +108,11 @@ class Segment:
         return sum(self._taken)
 
     def attach(self, secret: bytes) -> None:
-        """The client has opened the memory. Raises ServiceError: INVALID_REQUEST, wrong secret."""
+        """Record that the client has opened the memory.
+
+        Raises:
+            ServiceError: INVALID_REQUEST if the secret is wrong.
+        """
         if not secrets_equal(secret.hex(), self._secret.hex()):
             raise ServiceError(
                 ErrorCode.INVALID_REQUEST,
@@ -117,10 +123,10 @@ class Segment:
         self._remove_name()
 
     def slot(self, number: int | None) -> FrameSlot | None:
-        """The slot of a message; None if it names none, or the client has not attached.
+        """The slot of a message; None if the message names none or the client has not attached.
 
         Raises:
-            ServiceError: INVALID_REQUEST, there is no such slot.
+            ServiceError: INVALID_REQUEST if the slot does not exist.
         """
         if number is None or not self.attached:
             return None
@@ -198,7 +204,7 @@ class Segment:
 
 
 def _placed(frame: EncodedFrame, memory: NDArray[np.uint8], offset: int) -> EncodedFrame:
-    """The frame of a raw image that is copied there; NumPy releases the GIL meanwhile."""
+    """Copy a raw image to an offset and return its frame; NumPy releases the GIL meanwhile."""
     pixels = np.frombuffer(frame.data, np.uint8)
     np.copyto(memory[offset : offset + len(pixels)], pixels)
     return placed_frame(frame, offset)
@@ -216,7 +222,7 @@ class FrameSlot(NamedTuple):
     number: int
 
     def place(self, frames: Sequence[EncodedFrame]) -> list[EncodedFrame] | None:
-        """As :meth:`Segment.place`."""
+        """See :meth:`Segment.place`."""
         return self.segment.place(self.number, frames)
 
 
@@ -224,7 +230,7 @@ class Segments:
     """Shared memory of a worker's controllers, within the memory budget.
 
     Args:
-        budget: memory budget that counts it.
+        budget: memory budget that includes it.
         segment_bytes: size for one controller; 0 disables shared memory.
     """
 
@@ -240,7 +246,7 @@ class Segments:
         return sum(segment.taken_bytes for segment in self._segments)
 
     def idle(self) -> Sequence[IdleItem]:
-        """Nothing: clients may be using all of it."""
+        """Always empty, because clients may be using all of the memory."""
         return ()
 
     def create(self) -> Segment | None:
@@ -258,7 +264,7 @@ class Segments:
 
 
 def sweep_segments() -> list[Path]:
-    """Remove the names of this user's killed workers; returns them."""
+    """Remove the files left by this user's killed workers, and return their paths."""
     found = Path(SHM_FOLDER).glob(PREFIX + "[0-9a-f]" * 2 * NAME_BYTES)
     return [path for path in found if _removed_if_left(path)]
 

@@ -43,10 +43,10 @@ LogRecord = tuple[str, int, bytes]
 """Kind, step and payload of an entry of a session's log."""
 
 MakeReply = Callable[[World, Sequence[Event]], StoredReply | None]
-"""Creates the reply to store under a request's key, from the new world and the events."""
+"""Creates the reply that is stored under a request's key, from the new world and its events."""
 
 MakeEditReply = Callable[[World, EditOutcome], StoredReply | None]
-"""The same for an edit, from the edited world and its outcome."""
+"""Creates the stored reply to an edit, from the edited world and the outcome."""
 
 MAX_SNAPSHOTS = 32
 
@@ -148,7 +148,7 @@ class Stepper:
 
         Raises:
             WorldError: the plan is refused.
-            QueueFullError: the engine's queue is full; the same action may be sent again.
+            QueueFullError: the engine's queue is full. The same action may be sent again.
         """
         now = session.running_world()
         if plan is not None:
@@ -159,14 +159,14 @@ class Stepper:
             entry = action_payload(plan, latency_us=latency_us, missed=session.late)
         change = partial(_moved, now, plan, latency_us, session.late)
         observation = await self._move(session, change, entry, slot=slot)
-        # A repeated answer includes its images: the slot may have others by then.
+        # A repeated answer includes its images, because the slot may hold others by then.
         session.lockstep.advance(payload, observation.message, over=observation.world.over)
         return observation.answer
 
     async def step_without_action(self, session: Session) -> EncodedMessage:
         """Advance without the due action, by the episode's fallback; returns the observation.
 
-        The action is stale afterwards.
+        The due action becomes stale.
         """
         change = partial(_moved, session.running_world(), None, 0, True)
         entry = action_payload(None, missed=True)
@@ -208,10 +208,9 @@ class Stepper:
         return observation
 
     async def step(self, session: Session, n: int, plan: Plan | None, *, reply: MakeReply) -> None:
-        """Advance the clock ``n`` times under one plan, or to the end, without rendering.
+        """Advance the clock by ``n`` steps under one plan, or to the end, without rendering.
 
-        The steps take effect together or not at all; ``reply`` creates the reply that is stored
-        with them.
+        All steps take effect, or none. ``reply`` creates the reply that is stored with them.
 
         Raises:
             WorldError: the plan is refused, or the episode has already ended.
@@ -327,7 +326,7 @@ class Stepper:
         return observation
 
     async def _withdraw(self, session: Session) -> None:
-        """Withdraw entries that were stored ahead; with the next entry if the store fails."""
+        """Withdraw entries of a failed change; if the store fails, do so with the next entry."""
         try:
             await self._store.withdraw(session.row.claim, from_seq=session.next_seq)
         except StoreTroubleError:

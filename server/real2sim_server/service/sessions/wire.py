@@ -88,8 +88,9 @@ def pack_with_frames(
     *,
     clouds: Sequence[Sequence[Part]] = (),
 ) -> EncodedMessage:
-    """A message of ``members``, ``frames``, ``timing`` and, if any, ``clouds`` (maps, each in
-    parts).
+    """A message with members, frames, timing and optional point clouds.
+
+    Each cloud is a map in several parts.
 
     ``timing`` does not include sending.
     """

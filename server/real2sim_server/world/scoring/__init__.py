@@ -1,6 +1,6 @@
 """Versioned metrics of episodes, for running episodes and recordings alike.
 
-:mod:`.metric` has the registry, :mod:`.metrics` the metrics.
+:mod:`.metric` contains the registry, :mod:`.metrics` the metrics.
 """
 
 from .instant import ContactRecord, EgoSample, Instant, ObjectSamples, ScoringContext

@@ -49,7 +49,7 @@ class Window(Generic[T]):
         kept = min(self._length, most - 1)
         entries = self._entries
         try:
-            # Atomic, so that worlds that continue on two threads do not share entries.
+            # Popping is atomic, so that worlds that continue on two threads do not share entries.
             self._unclaimed.pop()
             shared = len(entries) < 2 * most
         except IndexError:
@@ -91,7 +91,7 @@ class RowWindow:
         kept = min(len(self.rows), most - 1)
         buffer, end = self._buffer, self._end
         try:
-            # As in Window.
+            # See Window.pushed.
             self._unclaimed.pop()
             shared = end < len(buffer)
         except IndexError:
@@ -260,7 +260,7 @@ HUGSIM_LON_JERK = 8.37
 class ComfortSample(NamedTuple):
     """Motion that passengers feel at one time, in SI units.
 
-    ``lon_acceleration`` is in the direction of the gear: negative values are braking, also in
+    ``lon_acceleration`` is in the direction of the gear: negative values are braking, even in
     reverse.
     """
 
@@ -335,8 +335,8 @@ class ComfortAccumulator:
     ) -> tuple[ComfortAccumulator, ComfortAccumulator]:
         """This accumulator and another one after one more clock step.
 
-        The other one has received the same samples since this one began; the shared samples are
-        stored and evaluated once.
+        Both have received the same samples since this one began. The shared samples are stored and
+        evaluated once.
         """
         window, sample = _newest(self.window, speed, yaw, dt)
         # A full window holds no older samples.
@@ -357,7 +357,7 @@ class ComfortAccumulator:
 def _newest(
     window: RowWindow, speed: float, yaw: float, dt: float
 ) -> tuple[RowWindow, ComfortSample | None]:
-    """The samples with one more, and the comfort sample once the window is full."""
+    """The window with one more row, and the comfort sample once the window is full."""
     full = comfort_window(dt)
     window = window.pushed((speed, yaw), full)
     return window, comfort_sample(window.rows, dt) if len(window) == full else None
@@ -422,7 +422,7 @@ PLACE_NOISE = 0.03
 
 SLIP = 0.05
 """Tolerated lateral over longitudinal displacement, in addition to the vehicle model. The position
-of the rear axle is rarely known more accurately."""
+of the rear axle is rarely known more precisely."""
 
 SPIN_S, SPIN_NOISE = 1.0, 0.1
 """Turning on the spot: time window [s], and heading noise in it [rad]."""
@@ -488,7 +488,7 @@ def _is_feasible(samples: Samples, dt: float) -> bool:
 
 
 def _follows(before: EgoSample, now: EgoSample, h: float) -> bool:
-    """Whether a car can get from one sample to another in ``h`` seconds."""
+    """Whether a car can move from one sample to another in ``h`` seconds."""
     if abs(now.speed - before.speed) > MAX_ACCELERATION * h * (1 + 1e-9):
         return False
     if now.speed < -MAX_REVERSE_SPEED and now.speed < before.speed:

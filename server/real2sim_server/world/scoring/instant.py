@@ -1,6 +1,6 @@
 """Score inputs: samples of an instant, episode context, time to collision and fault."""
 
-# ruff: noqa: PLR0917 - compiled loops take their arrays one by one
+# ruff: noqa: PLR0917 - compiled loops take each array as an argument
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ class ContactRecord:
         relative_speed, ego_speed, object_speed: at the start of the contact [m/s].
         impulse: impulse on the ego [N s]; zero without collision response.
         begun: whether the contact began in this step.
-        since: its start as a fraction of the step.
+        since: start of the contact as a fraction of the step.
     """
 
     object_id: str | None
@@ -134,7 +134,7 @@ class ScoringContext:
         rear_overhang: distance from the rear axle to the rear end of the box [m].
         ego_mass: [kg].
         route: [R, 2] float64, recorded path [m].
-        lanes: polylines [N, 2] of recorded vehicles, whose corridors are drivable too.
+        lanes: polylines [N, 2] of recorded vehicles [m], whose corridors are also drivable.
         corridor, lane: half widths of the route and of the lanes [m].
         speed_limit: [m/s] or None.
         start_s, route_end_s: route position of the log at the start and at the horizon [m].
@@ -216,7 +216,7 @@ class ScoringContext:
         return bool(in_lane((x, y, ego.path_yaw), self._lane_points, self.lane))
 
     def lane_offset(self, ego: EgoSample) -> float:
-        """Offset from the centre of the map lane, else of the route, positive left [m]."""
+        """Offset from the centre of the map lane, or else of the route [m], positive left."""
         return ego.offset if self.road_map is None else self.road_map.lane_offset(ego)
 
     def distance_against_traffic(self, ego: EgoSample, way: float, gain: float) -> float:
@@ -229,7 +229,7 @@ class ScoringContext:
         return way if self.road_map.is_against(ego, self.centre_ahead) else 0.0
 
     def limit_at(self, ego: EgoSample) -> float | None:
-        """The speed limit of the ego [m/s]: that of the request, else of the map."""
+        """The speed limit of the ego [m/s], from the request or else from the map."""
         if self.speed_limit is not None or self.road_map is None:
             return self.speed_limit
         return self.road_map.speed_limit(ego)
@@ -300,7 +300,7 @@ STEPS = 31
 """Number of times from 0 to the horizon."""
 
 AHEAD, BEHIND = math.radians(30), math.radians(150)
-"""Objects within the first bearing are ahead, beyond the second one behind (nuPlan) [rad]."""
+"""Objects within the first bearing are ahead, those beyond the second are behind (nuPlan) [rad]."""
 
 
 @kernel
@@ -438,7 +438,7 @@ def side_of_contact(
         ego_speed, speed: before the contact, along and across [m/s].
         axle: distance from the centre of the ego box back to the rear axle, the reference for
             objects behind [m].
-        reversing: whether the ego is in reverse gear; its tail is then its front.
+        reversing: whether the ego is in reverse gear, so that its rear counts as its front.
     """
     if abs(ego_speed) <= STOPPED:
         return "stopped_ego"
@@ -481,8 +481,8 @@ def _segment_intersects(
 def ego_at_fault(record: ContactRecord, off_lane: bool) -> bool:
     """Whether the ego is at fault (nuPlan).
 
-    It is in front contacts, in contacts with stopped vehicles, and in lateral contacts outside its
-    lane.
+    The ego is at fault in front contacts, in contacts with stopped vehicles, and in lateral
+    contacts outside its lane.
     """
     if record.side in {"front", "stopped_track"}:
         return True
@@ -500,7 +500,7 @@ ALONG = 0.5
 """Minimum cosine between an ego's heading and the direction of a stop line."""
 
 LAMPS = {"on", "off", "flashing", "counting"}
-"""Words of states that list lamps, red first, such as ``off;off;on``."""
+"""Lamp states of a signal state such as ``off;off;on``, red first."""
 
 
 class StopLineAt(NamedTuple):
@@ -529,7 +529,7 @@ class TrafficLights:
 
     @property
     def seen(self) -> bool:
-        """Whether there were any signals."""
+        """Whether any signals have been seen."""
         return bool(self.placed or self.unplaced)
 
     def updated(
@@ -569,7 +569,7 @@ NO_LIGHTS = TrafficLights()
 def shows_red(state: str) -> bool:
     """Whether a signal state means stop.
 
-    Stop states are ``red``, also in combination (``red;amber``), ``stop``, and lamp lists with the
+    Stop states are ``red``, even in combination (``red;amber``), ``stop``, and lamp lists with the
     first lamp on (``on;off;off``, red first as in OpenDRIVE).
     """
     words = re.findall(r"[a-z]+", state.lower())
@@ -581,8 +581,8 @@ def shows_red(state: str) -> bool:
 def stop_lines(signal: ShownSignal, context: ScoringContext) -> Iterator[StopLineAt]:
     """Stop lines of a signal.
 
-    Uses the line of the storyboard, as wide as a lane, else the stop line of the map, else the
-    ends of the signal's lanes. Empty if none is known.
+    Uses the line of the storyboard with the width of a lane. Without one, uses the stop line of the
+    map, or else the ends of the signal's lanes. Empty if none is known.
     """
     graph = None if context.road_map is None else context.road_map.graph
     if signal.stop_line is not None:

@@ -57,7 +57,7 @@ class MetricAccumulator:
         offset: current offset from the route [m].
         at_fault: at-fault contacts of the ego, by kind: vehicle, vru, object.
         contacts: number of new contacts, by category.
-        off_road, far_off_road: whether a corner ever left the corridor; by more than 0.3 m.
+        off_road, far_off_road: whether a corner ever left the road at all, or by more than 0.3 m.
         ttc: current time to collision [s].
         min_ttc: smallest time to collision so far [s].
         comfort, comfort_with_history: comfort of the drive, without and with the log before the
@@ -66,9 +66,9 @@ class MetricAccumulator:
             [m]; empty if there are none.
         oncoming: longest distance against the route within one second [m].
         lane_run: time for which the lane offset has been too large [s].
-        left_lane: whether that ever lasted 2 s.
+        left_lane: whether the lane offset was ever too large for 2 s.
         plan: newest plan.
-        plans_compared, plans_disagree: number of compared plan pairs; whether any pair differs.
+        plans_compared, plans_disagree: number of compared plan pairs, and whether any pair differs.
         overspeed: integral of the speed above the limit [m].
         hugsim: sum of HUGSIM's step scores.
         feasibility: kinematic feasibility of the drive.
@@ -130,7 +130,7 @@ class MetricAccumulator:
 
 MIN_ROUTE = 1.0
 """Minimum length of a recorded drive for relative progress [m]; shorter drives are stationary. A
-short drive counts as well, so that an ego that does not move makes no progress."""
+short drive counts as well, so that a stationary ego makes no progress."""
 
 
 def expert_progress(accumulator: MetricAccumulator, context: ScoringContext) -> float:
@@ -167,10 +167,10 @@ UNSEEN: dict[Aspect, str] = {
 """Phrases for inputs that a score ignores, most important first."""
 
 LONG_STEP = 0.1
-"""Maximum clock step for gapless TTC values [s]; TTC is evaluated once per step."""
+"""Maximum clock step without gaps between TTC values [s]; TTC is evaluated once per step."""
 
 NOT_NOTICED = 2.0
-"""Minimum distance to mention [m]."""
+"""Minimum distance mentioned in a score's blind spots [m]."""
 
 
 def cannot_see(
@@ -340,7 +340,7 @@ class Metric:
         """The score of an episode so far."""
         found = self.formula(accumulator, context)
         if not accumulator.steps:
-            # No step was scored.
+            # No step has been scored.
             found = MetricValue(None, {}, missing=(NO_STEP,))
         blind = "" if self.sees is None else cannot_see(self.sees, accumulator, context)
         return Score(
@@ -554,9 +554,9 @@ def update_accumulator(
 
 
 def _against_route(backward: Float, way: float, dt: float) -> tuple[Float, float]:
-    """Append ``way`` to the distances driven against the route within a second; also their sum [m].
+    """Distances driven against the route in each step of the last second, and their sum [m].
 
-    Empty until the first of them.
+    ``way`` is the distance of the newest step. The array is empty if all distances are zero.
     """
     if not way and not len(backward):
         return backward, 0.0
@@ -565,14 +565,14 @@ def _against_route(backward: Float, way: float, dt: float) -> tuple[Float, float
 
 
 def _left_out(gain: float, way: float) -> float:
-    """Part of a step's route progress [m] that a short cut skipped; negative on the way back."""
+    """Route progress in a step that a short cut skipped [m]; negative after a jump backwards."""
     return gain - math.copysign(way, gain) if abs(gain) > BEND * way + SHORT_CUT else 0.0
 
 
 def _updated_states(
     accumulator: MetricAccumulator, instant: Instant, context: ScoringContext
 ) -> Mapping[str, Any]:
-    """Updated states of the metrics that have one."""
+    """Updated states of all metrics with a state."""
     states = accumulator.states
     if not states:
         return states

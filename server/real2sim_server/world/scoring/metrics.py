@@ -28,13 +28,13 @@ NO_MAP = "no map: corridor and lanes come from the recorded drive"
 
 
 def progress_along_route(accumulator: MetricAccumulator) -> float:
-    """Progress along the route [m], without reverse driving and distance skipped by short cuts."""
+    """Progress along the route [m], excluding reverse driving and short cuts."""
     driven = accumulator.s - accumulator.tail_first - accumulator.cut
     return max(driven - accumulator.start_s, 0.0)
 
 
 def relative_progress(accumulator: MetricAccumulator, context: ScoringContext) -> float:
-    """Progress as a fraction of the recorded drive, at most 1; 1 if that is stationary."""
+    """Progress as a fraction of the recorded drive, at most 1; 1 if that drive is stationary."""
     expert = expert_progress(accumulator, context)
     if expert < MIN_ROUTE:
         return 1.0

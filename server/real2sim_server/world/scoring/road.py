@@ -20,7 +20,7 @@ DENSITY = 0.25
 """Maximum distance between points of road lines [m]."""
 
 MAX_SPACING = DENSITY * (1 + 1e-9)
-"""Spacings exceed ``DENSITY`` by rounding; the margin keeps the search exact [m]."""
+"""Maximum spacing with a margin for rounding, which keeps the search exact [m]."""
 
 
 @kernel
@@ -44,7 +44,7 @@ def off_road(middle, size, route, lanes, half_widths):
     cos, sin = math.cos(yaw), math.sin(yaw)
     points, beyond = np.empty((8, 2)), np.empty(8)
     for k in range(8):
-        # Corners, and the centres of quarters, which are half as far from the middle of the box.
+        # Corners, then centres of quarters, which are half as far from the middle of the box.
         far = 0.5 if k < 4 else 0.25
         u = far * size[0] if k % 4 < 2 else -far * size[0]
         v = far * size[1] if 0 < k % 4 < 3 else -far * size[1]
@@ -166,15 +166,15 @@ class RoadMap:
     def of(cls, graph: LaneGraph | None) -> RoadMap | None:
         """The road map of a lane graph.
 
-        None without a graph, or if its lanes come from the recorded drive only: the scores use the
-        recording itself then.
+        None without a graph, or if its lanes come only from the recorded drive. The scores then use
+        the recording directly.
         """
         return None if graph is None or graph.source == "log" else cls(graph)
 
     def off_road(
         self, middle: tuple[float, float, float], size: tuple[float, float, float]
     ) -> tuple[float, int]:
-        """Off-road distance [m] and number of quarters on the road, as :func:`.off_road`."""
+        """Off-road distance [m] and number of quarters on the road; see :func:`.off_road`."""
         x, y, yaw = middle
         cos, sin = math.cos(yaw), math.sin(yaw)
         turn = np.array([[cos, sin], [-sin, cos]])
