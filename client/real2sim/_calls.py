@@ -42,14 +42,14 @@ class RetryPolicy:
     Attributes:
         retries: retries after the first try; 0 disables them.
         first_delay: seconds before the first retry; doubles with each.
-        longest_delay: maximum back-off in seconds.
-        longest_wait_asked: longest accepted ``Retry-After`` in seconds; longer ones end retries.
+        max_delay: maximum back-off in seconds.
+        max_retry_after: longest accepted ``Retry-After`` in seconds; longer ones end retries.
     """
 
     retries: int = 2
     first_delay: float = 0.5
-    longest_delay: float = 8.0
-    longest_wait_asked: float = 120.0
+    max_delay: float = 8.0
+    max_retry_after: float = 120.0
 
     def __post_init__(self) -> None:
         if self.retries < 0:
@@ -66,8 +66,8 @@ class RetryPolicy:
         if attempt >= self.retries:
             return None
         if retry_after is not None:
-            return retry_after if retry_after <= self.longest_wait_asked else None
-        backoff = min(self.first_delay * 2.0**attempt, self.longest_delay)
+            return retry_after if retry_after <= self.max_retry_after else None
+        backoff = min(self.first_delay * 2.0**attempt, self.max_delay)
         return backoff * (1.0 - 0.25 * jitter())
 
 
@@ -107,7 +107,9 @@ def sent_fields(model: BaseModel) -> dict[str, Any]:
     fields, known = {}, type(model).model_fields
     constants, given = _constants(type(model)), model.model_fields_set
     for name, value in vars(model).items():
-        if name in constants or (name in given and (value is not None or _says(known[name]))):
+        if name in constants or (
+            name in given and (value is not None or _null_differs(known[name]))
+        ):
             fields[name] = _sent(value)
     return fields
 
@@ -148,7 +150,7 @@ def _sent(value: Any) -> Any:
     return value
 
 
-def _says(field: Any) -> bool:
+def _null_differs(field: Any) -> bool:
     """Whether None differs from the default of a member."""
     return field.is_required() or field.get_default(call_default_factory=True) is not None
 

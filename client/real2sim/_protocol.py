@@ -248,7 +248,7 @@ class ProtocolState:
             return None
         if not isinstance(message, request.answer) or message.id != request.id:
             raise MalformedReplyError(
-                f"{type(message).__name__.lower()} with id {message.id} came where "
+                f"{type(message).__name__.lower()} with id {message.id} arrived, but "
                 f"{request.awaited} with id {request.id} was awaited"
             )
         self._track(message)

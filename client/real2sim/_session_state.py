@@ -145,7 +145,7 @@ class SharedFrames:
         if all(frame.offset is None for frame in frames):
             return [None] * len(frames)
         if self._lent is None:
-            raise MalformedReplyError("an image in shared memory where no slot was named")
+            raise MalformedReplyError("an image in shared memory, but the request named no slot")
         slot, self._lent = self._lent, None
         begin = self._begin(slot)
         # All views share this array; the slot is returned when the last of them is released.

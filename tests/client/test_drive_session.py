@@ -173,7 +173,7 @@ def test_a_worker_that_leaves_is_reported_with_its_reason(worker: FakeWorker) ->
     [
         ("garbage", "cannot be read"),
         ("text", "sent text"),
-        ("another type", "edited with id 3 came where observation 1"),
+        ("another type", "edited with id 3 arrived, but observation 1"),
         ("missing fields", "t_us: Field required"),
     ],
 )

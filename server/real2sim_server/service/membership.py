@@ -323,7 +323,7 @@ class Membership:
         self._renewed = asked
         if lapsed:
             log.warning("the lease had run out", seconds=self._seconds)
-            await self._sessions.let_go_of_lost()
+            await self._sessions.drop_lost()
 
     async def _hear_of_others(self) -> None:
         """Read other workers' account usage, if it is limited."""

@@ -260,7 +260,7 @@ class World:
         controller, loop_events = self._loop(controller)
         trajectory = controller.pending[-1].trajectory if plan is not None else None
         controller, late_events = self._with_fallback(controller, missed=missed)
-        reaction_events = self._let_agents_react()
+        reaction_events = self._update_reactive_agents()
         start = self._step_start(controller)
         since_us, body = self.t_us, self.T_world_body
         moved = self._advance(controller)
@@ -497,7 +497,7 @@ class World:
         data = {"lap": float(self.lap), **put.loop._asdict()}
         return controller.looped(put.loop), [Event("looped", self.t_us, data=data)]
 
-    def _let_agents_react(self) -> list[Event]:
+    def _update_reactive_agents(self) -> list[Event]:
         """Switch objects from replay to reactive driving once the ego is too far off its log."""
         agents = self.spec.agents
         if agents.ego_off_log == "replay" or self.traffic.reacting:

@@ -164,7 +164,7 @@ def test_standing_still_makes_no_way_and_is_worth_that(judged):
     values = {n: found[n].value for n in SCORES}
     expected = {"pdms": 7 / 12, "nuplan_cls": 0, "hugsim_hd": 0, "carla_ds": 0, "alpasim": 0}
     assert values == pytest.approx(expected | {"neuroncap": 5.0})
-    assert "standing still where the recorded drive goes 35 m" in found["neuroncap"].cannot_see
+    assert "standing still while the recorded drive covers 35 m" in found["neuroncap"].cannot_see
 
 
 def test_driving_backwards_is_worth_no_more_than_standing(judged):
@@ -217,7 +217,7 @@ def test_a_short_cut_is_no_way_along_the_route(make_world):
         assert cut[name].value < whole[name].value, name
     assert cut["carla_ds"].terms["RC"] < 1.0
     assert metrics["route_progress"] < 50.0
-    assert "left out by a short cut" in cut["neuroncap"].cannot_see
+    assert "skipped by a shortcut" in cut["neuroncap"].cannot_see
 
 
 def test_a_drive_without_a_step_has_no_scores(judged, make_world, pulling_away):
@@ -236,8 +236,8 @@ def test_who_ends_early_is_told_that_the_rest_was_not_seen(make_world, pulling_a
     early = {s.name: s.cannot_see for s in world.scores()}
     whole, _ = judged(honest)
 
-    assert all("what comes after 1 s (the episode may last 6 s)" in said for said in early.values())
-    assert not any("what comes after" in score.cannot_see for score in whole.values())
+    assert all("events after 1 s (the episode may last 6 s)" in said for said in early.values())
+    assert not any("events after" in score.cannot_see for score in whole.values())
     assert "following closely" in whole["pdms"].cannot_see
 
 

@@ -305,7 +305,7 @@ def test_way_driven_tail_first_is_no_progress(facing, progress):
     assert found["pdms"].value <= (7 + 5 * progress) / 12 + 1e-9
     for name in ("nuplan_cls", "hugsim_hd", "carla_ds", "alpasim"):
         assert (found[name].value > 0) == bool(progress), name
-    assert ("16 m of the route driven tail first" in found["neuroncap"].cannot_see) == bool(facing)
+    assert ("16 m of the route driven in reverse" in found["neuroncap"].cannot_see) == bool(facing)
 
 
 def test_coming_too_near_costs_the_ttc_term():

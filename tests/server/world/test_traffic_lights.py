@@ -127,7 +127,7 @@ def test_what_is_assumed_says_which_signals_counted():
     placed = judged(with_signal(always("red")))
     assert lights(placed, plain) == "TLC: stop lines of 1 signals of the storyboard"
     unknown = judged(with_signal(always("red"), line=None, name="elsewhere"))
-    assert "where to stop for 1 others is not known" in lights(unknown, plain)
+    assert "1 others have no known stop line" in lights(unknown, plain)
     other = with_signal(always("red"), name="elsewhere")
     assert "others of the map show no phases" in lights(judged(other, on_map), on_map)
 

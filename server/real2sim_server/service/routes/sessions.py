@@ -45,7 +45,7 @@ from ..renderer import CODEC_OF, choose_media_type
 from ..sessions.pipeline import StepPipeline
 from ..sessions.recording import RECORDING, recording_of
 from ..sessions.registry import check_not_closed, created_headers
-from ..sessions.sensors import looking
+from ..sessions.sensors import ranging_for_render
 from ..sessions.session import (
     Session,
     opens_session,
@@ -418,7 +418,7 @@ async def view_response(
         ServiceError: NOT_ACCEPTABLE, or as StepPipeline.view().
     """
     sensors: Sequence[SensorSpec] = asked.sensors
-    ranging = await looking(world, asked)
+    ranging = await ranging_for_render(world, asked)
     single = not ranging and len(sensors) == 1 and len(sensors[0].modalities) == 1
     if single:
         media_type = choose_media_type(accept, sensors[0].modalities[0])

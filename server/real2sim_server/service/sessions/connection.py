@@ -50,7 +50,7 @@ from .messages import (
     with_progress,
 )
 from .registry import Sessions
-from .sensors import looking
+from .sensors import ranging_for_render
 from .session import ObserverQueue, Session, controller_taken, result_fields, welcome_fields
 from .shared_memory import FrameSlot, Segment
 from .step import Stepper
@@ -336,7 +336,10 @@ class Connection:
                 session.check_open()
                 world, slot = session.running_world(), self._slot(message.slot)
                 view = await self._sessions.pipeline.view(
-                    world, message.sensors, ranging=await looking(world, message), slot=slot
+                    world,
+                    message.sensors,
+                    ranging=await ranging_for_render(world, message),
+                    slot=slot,
                 )
                 return view.answer
             case Attach() | Agent() | Snapshot() | Restore() | Fork():
@@ -346,7 +349,7 @@ class Connection:
             case Bye():
                 return await self._finish(role)
             case Hello():
-                raise bad_message("hello has been said already")
+                raise bad_message("hello was already received")
             case _:
                 assert_never(message)
 
@@ -356,7 +359,7 @@ class Connection:
         arrived, slot = time.perf_counter(), self._slot(action.slot)
         if action.step == session.lockstep.step:
             self._deadline_timer.cancel()
-        await self._until_let(action)
+        await self._wait_for_clock(action)
         async with session.lock:
             given_before = self._check(action, content)
             if given_before is not None:
@@ -372,7 +375,7 @@ class Connection:
             self._sessions.metrics.steps.observe(time.perf_counter() - arrived)
             return answer
 
-    async def _until_let(self, action: Action) -> None:
+    async def _wait_for_clock(self, action: Action) -> None:
         """Wait until the clock lets the action pass.
 
         Sends progress messages while the clock is held, so that clients do not time out.
@@ -441,7 +444,7 @@ class Connection:
         if role == "controller":
             self._deadline_timer.cancel()
             session.close_callbacks.discard(self._close_with_error)
-            await self._sessions.close(session, reason="its controller said bye")
+            await self._sessions.close(session, reason="its controller ended it")
         return pack_message("result", result_fields(session.world, scores))
 
     # --- shared memory ------------------------------------------------------------------------

@@ -212,7 +212,7 @@ class Sessions:
     ) -> None:
         self.pipeline = pipeline
         self.segments = segments
-        self.stepper = Stepper(pipeline, kernels, store, on_fenced=self.let_go)
+        self.stepper = Stepper(pipeline, kernels, store, on_fenced=self.drop)
         self.metrics = metrics
         self.draining = self._handed_over = False
         self.resume_key = secrets.token_bytes()
@@ -482,7 +482,7 @@ class Sessions:
         self._tell(session, session.closed)
         log.info("session closed", session_id=session.session_id, reason=reason)
 
-    def let_go(self, session: Session) -> None:
+    def drop(self, session: Session) -> None:
         """Drop a session that another worker has taken over or may take over. Idempotent.
 
         Its connections are redirected.
@@ -499,14 +499,14 @@ class Sessions:
         """Hand over all sessions to other workers and accept no more. Their logs are complete."""
         self.draining = self._handed_over = True
         for session in list(self):
-            self.let_go(session)
+            self.drop(session)
 
-    async def let_go_of_lost(self) -> None:
+    async def drop_lost(self) -> None:
         """Drop all sessions that other workers took over because they considered this one dead."""
         epochs = await self._leases.epochs(list(self._open))
         for session in self:
             if epochs.get(session.session_id) != session.row.epoch:
-                self.let_go(session)
+                self.drop(session)
 
     def evict(self, session: Session) -> None:
         """Free the memory of a session without connections; :meth:`find` rebuilds it."""

@@ -96,7 +96,7 @@ async def mount_sensors(
     return await asyncio.to_thread(mounted)
 
 
-async def looking(world: World, asked: SessionRender | Render) -> RangingSensors:
+async def ranging_for_render(world: World, asked: SessionRender | Render) -> RangingSensors:
     """LiDARs and radars of a render request. Raises WorldError: INVALID_REQUEST."""
     return await mount_sensors(asked.lidars, asked.radars, world.spec.dt_us)
 

@@ -184,7 +184,7 @@ def cannot_see(
     blind += _seen_in_part(sees, accumulator, context)
     seconds, most = accumulator.steps * context.dt, context.horizon * context.dt
     if not accumulator.contacts and seconds + context.warmup_steps * context.dt < most - 1e-9:
-        blind.append(f"what comes after {seconds:g} s (the episode may last {most:g} s)")
+        blind.append(f"events after {seconds:g} s (the episode may last {most:g} s)")
     seen = "lights" in sees and bool(accumulator.lights.placed)
     blind.append(f"{'signs' if seen else 'traffic lights, signs'} and right of way (no map)")
     if not context.background:
@@ -233,13 +233,13 @@ def _uncounted(
     if "progress" not in sees and accumulator.distance < NOT_NOTICED:
         recorded = expert_progress(accumulator, context)
         if recorded > NOT_NOTICED:
-            found.append(f"standing still where the recorded drive goes {recorded:.0f} m")
+            found.append(f"standing still while the recorded drive covers {recorded:.0f} m")
     if "direction" not in sees and accumulator.oncoming >= NOT_NOTICED:
         found.append(f"up to {accumulator.oncoming:.0f} m in a second against the route")
     if "progress" not in sees and accumulator.tail_first >= NOT_NOTICED:
-        found.append(f"{accumulator.tail_first:.0f} m of the route driven tail first")
+        found.append(f"{accumulator.tail_first:.0f} m of the route driven in reverse")
     if "progress" not in sees and accumulator.cut >= NOT_NOTICED:
-        found.append(f"{accumulator.cut:.0f} m of the route left out by a short cut")
+        found.append(f"{accumulator.cut:.0f} m of the route skipped by a shortcut")
     if "lane" not in sees and accumulator.outside >= NOT_NOTICED:
         found.append(f"{accumulator.outside:.0f} m off all driven lanes")
     if "lights" not in sees and (ran := len(accumulator.lights.ran)):

@@ -106,7 +106,7 @@ def lights(accumulator: MetricAccumulator, context: ScoringContext) -> str:
         return f"TLC: {phases}"
     told = f"TLC: stop lines of {len(seen.placed)} signals of the storyboard"
     if seen.unplaced:
-        told += f"; where to stop for {len(seen.unplaced)} others is not known"
+        told += f"; {len(seen.unplaced)} others have no known stop line"
     if mapped - seen.placed - seen.unplaced:
         told += "; others of the map show no phases"
     return told
