@@ -190,7 +190,7 @@ def test_an_asset_in_a_history_cannot_be_deleted_before_the_scenario(client):
     assert client.delete("/v1/assets/red").status_code == 204
 
 
-def test_an_asset_whose_id_is_a_prefix_of_a_used_id_can_be_deleted(client):
+def test_an_asset_whose_id_resembles_a_used_id_can_be_deleted(client):
     for name in ("red", "red_2", "redx2"):
         client.post("/v1/assets", json=CUT | {"asset_id": name})
     edit(client, create(client), {"op": "insert", "asset_id": "redx2", "pose": THERE})
