@@ -587,7 +587,7 @@ def test_every_response_has_security_headers(client, path):
     headers = client.get(path, follow_redirects=False).headers
     assert "default-src 'none'" in headers["Content-Security-Policy"]
     policy = headers["Content-Security-Policy"]
-    # Only the studio compiles WebAssembly (its vendored renderer). No page evaluates text as script.
+    # Only the studio compiles WebAssembly (its vendored renderer). No page evaluates text as code.
     allowed = {"'wasm-unsafe-eval'"} if path == "/ui/" else set()
     assert {word.strip(";") for word in policy.split() if "unsafe" in word} == allowed
     assert headers["X-Content-Type-Options"] == "nosniff"

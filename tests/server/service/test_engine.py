@@ -65,7 +65,7 @@ def test_an_engine_survives_the_end_of_the_calling_event_loop(make_engine):
     engine, gate = make_engine(), Gate()
 
     async def ask_and_leave() -> None:
-        # The task has no other reference and is never cancelled, as when a loop is stopped abruptly.
+        # No other reference, and never cancelled, as when a loop is stopped abruptly.
         asyncio.ensure_future(engine.call(gate.job))  # noqa: RUF006
         await until_entered(gate)
 

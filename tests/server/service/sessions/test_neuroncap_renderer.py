@@ -129,7 +129,7 @@ def test_updated_actors_are_rendered_at_their_new_poses(serve, tiny_scene):
         tiny_scene, pixels(render(http, camera_at(tiny_scene, 0), 0)), there
     )
     assert red_value - green > 60
-    # Actors missing from an update are removed. An actor exists only between its first and last time.
+    # Actors missing from an update are removed, and exist only between their first and last time.
     gone = pixels(render(http, camera_at(tiny_scene, 0), 2_100_000))
     http.post("/update_actors", json=[])
     assert np.array_equal(gone, pixels(render(http, camera_at(tiny_scene, 0), 0)))
