@@ -1,4 +1,4 @@
-"""The scripts of ``examples`` run as they are, in an empty folder."""
+"""The scripts of ``examples``, run unchanged in an empty folder."""
 
 from __future__ import annotations
 

@@ -230,7 +230,7 @@ def test_the_field_of_view_is_horizontal():
 
 
 def test_reprojected_images_keep_directions(planner):
-    # A camera between two others: its left half comes from the left one, its right half from the right.
+    # Between two cameras: the left half comes from the left one, the right half from the right one.
     wide = np.array([[24.0, 0, 24], [0, 24.0, 16], [0, 0, 1]])
     left, right = (PinholeView(wide, (48, 32), rig.turned(d) @ rig.FORWARD) for d in (45, -45))
     wanted = PinholeView(wide, (48, 32), rig.FORWARD)
