@@ -53,8 +53,7 @@ def compile_alone(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Callabl
     """Run a function that compiles kernels in only one process of this run.
 
     The other processes wait and load the result from disk. Time limits apply to tests, not to
-    fixtures,
-    so waiting does not fail a test.
+    fixtures, so waiting does not fail a test.
     """
     folder = tmp_path_factory.getbasetemp()
     if "PYTEST_XDIST_WORKER" in os.environ:

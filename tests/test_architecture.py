@@ -52,16 +52,16 @@ LAYERS = (
     "learning",
     "cli",
 )
-"""Packages and single modules of the server, lowest first: each imports only those before it."""
+"""Packages and modules of the server, lowest first. Each imports only earlier ones."""
 
 PLAY_THEIR_OWN_USER = {"demo", "policies", "sweeps", "cli"}
-"""Only these use the client SDK, since there the program plays its own user."""
+"""Only these import the client SDK, because they act as clients of a worker."""
 
 FORBIDDEN = {
     "real2sim_proto": {"real2sim", SERVER, "torch", "fastapi", "numba", "cv2"},
     "real2sim": {SERVER, "torch", "fastapi", "numba"},
 }
-"""What a distribution's contract and SDK never import, at the top of a file or inside."""
+"""Imports forbidden in the protocol and the SDK, at any level of a file."""
 
 
 @cache

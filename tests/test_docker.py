@@ -54,8 +54,7 @@ def mounts(worker, **variables: str) -> dict[str, str]:
 
 
 def test_mounts_are_volumes_that_the_worker_can_write(compose, worker):
-    """A new Docker volume gets the owner of its path in the image. A bind-mounted folder belongs
-    to root."""
+    """A new Docker volume gets the owner of its path in the image. Bind mounts belong to root."""
     volumes = mounts(worker)
     assert set(volumes.values()) <= compose["volumes"].keys()
     owned = re.findall(

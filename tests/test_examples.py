@@ -25,7 +25,7 @@ EXAMPLES = {
     "dataset": ("boxes", "dataset"),
     "train_policy": ("round 5: ", None),
 }
-"""What each example prints, and a file or folder that it leaves."""
+"""Output of each example, and a file or folder that it creates."""
 
 
 @pytest.fixture(scope="module")

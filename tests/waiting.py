@@ -10,7 +10,7 @@ from typing import TypeVar
 T = TypeVar("T")
 
 LIMIT_S = 120.0
-"""Far longer than anything takes, even on a busy machine [s]."""
+"""Much longer than any wait takes, even on a busy machine [s]."""
 
 POLL_S = 0.01
 

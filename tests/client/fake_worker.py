@@ -38,7 +38,7 @@ OBJECT = {
     "end_us": 10_000_000,
 }
 SHORT_S = 0.05
-"""A time that tests let run out: nothing that must come is waited for so shortly."""
+"""Timeout that tests let expire [s]. Never used for an answer that must arrive."""
 SCENE = {"scene": "street", "state": "resident", "cameras": [CAMERA], "objects": [OBJECT]}
 
 
@@ -274,7 +274,7 @@ class FakeWorker:
             answer = {"type": "edited", "revision": episode.revision, "created": ["car_3_copy1"]}
         elif isinstance(message, Render):
             if self.mischief == "late images":
-                await asyncio.sleep(5 * SHORT_S)  # Longer than most timeouts.
+                await asyncio.sleep(5 * SHORT_S)  # Longer than the reply timeout of the test.
             answer = {
                 "type": "view",
                 "t_us": episode.t_us,

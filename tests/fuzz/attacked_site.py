@@ -1,5 +1,4 @@
-"""A worker under attack in this process, its resources, and a client that drives at the same
-time."""
+"""A worker under attack in this process, its resources, and a client that drives at the same time."""
 
 from __future__ import annotations
 
@@ -27,7 +26,7 @@ from tests.waiting import LIMIT_S, wait_until
 
 TOKEN = "a long enough secret"
 DEAD_S = LIMIT_S
-"""After which a worker that says nothing hangs, however busy the machine is."""
+"""A worker silent for this long hangs, even on a busy machine [s]."""
 PATIENT_S = 600
 EPISODE_STEPS = 15
 SENSOR = {"camera": "front", "width": 16, "codec": "raw"}
@@ -98,9 +97,7 @@ class Site:
         token: str = TOKEN,
         may_conflict: bool = False,
     ) -> Any:
-        """The JSON body of a response. None if ``path`` is not found, or if a request that
-        ``may_conflict`` does.
-        """
+        """The JSON body of a response. None if not found, or on a conflict if ``may_conflict``."""
         connection = http.client.HTTPConnection(*self.address, timeout=PATIENT_S)
         headers = {"Authorization": f"Bearer {token}", "Content-Type": "application/json"}
         try:
@@ -192,8 +189,7 @@ class Driver:
             pass
 
     def drive(self) -> None:
-        """Drive one step. Raises AssertionError if it differs from the same step of the first
-        episode."""
+        """Drive one step. Raises AssertionError if it differs from the first episode."""
         if self._step in (-1, EPISODE_STEPS):
             if self._step == EPISODE_STEPS:
                 self._first = self._first or self._poses

@@ -84,7 +84,7 @@ def _splice(data: bytes, others: list[bytes], rng: random.Random) -> bytes:
 
 
 def _text(data: bytes, others: list[bytes], rng: random.Random) -> bytes:
-    """Replace a decimal number with another one."""
+    """Replace a decimal digit with another number."""
     digits = [k for k, b in enumerate(data[:4096]) if 48 <= b <= 57]
     if not digits:
         return data

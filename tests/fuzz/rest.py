@@ -49,9 +49,9 @@ HEADERS = {
 METHODS = ("GET", "POST", "PUT", "PATCH", "DELETE", "HEAD", "OPTIONS", "TRACE", "CONNECT", "X" * 99)
 SIMPLE = METHODS[:5]
 BUSY = frozenset({"QUEUE_FULL", "OVER_CAPACITY", "QUOTA_EXCEEDED", "UNSUPPORTED"})
-"""Codes of 5xx that the worker announces. Without memory, and in trouble, it may not be."""
+"""Allowed error codes with status 5xx. A healthy worker gives no others."""
 QUIET_S = 0.03
-"""For an answer to a request that may never have been whole."""
+"""Timeout for the response to a request that may be incomplete [s]."""
 
 
 @dataclass(frozen=True)

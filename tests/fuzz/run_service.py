@@ -28,9 +28,9 @@ from attacked_site import Site, attacked
 from run_target import DEAD_S, GROWTH_BYTES, HANG_S, limit_memory, resident
 
 BESIDE = 5
-"""Inputs between two steps of whom the attack is beside."""
+"""Number of inputs between two steps of the concurrent drive."""
 TIDY = 250
-"""Inputs between two occasions to remove what was made."""
+"""Number of inputs between two cleanups."""
 MAX_FAILURES = 20
 
 Attack = Callable[[int, random.Random], str]

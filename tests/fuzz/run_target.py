@@ -28,9 +28,9 @@ import readers
 
 MEMORY_BYTES = 2 << 30
 HANG_S = 20.0
-"""Of processor time, for what takes milliseconds: a loop that damage makes endless, or long."""
+"""CPU time [s] that counts as a hang. Normal inputs take milliseconds."""
 DEAD_S = 120.0
-"""After which a reader that is still at it hangs, however busy the machine is."""
+"""A reader still running after this time hangs, even on a busy machine [s]."""
 MAX_KEPT = 500
 MAX_PART_BYTES = 1 << 20
 GROWTH_BYTES = 256 << 20

@@ -19,7 +19,7 @@ from real2sim_proto import DRIVE_SUBPROTOCOL, decode, encode
 TEXT, BINARY, CLOSE, PING, PONG = 1, 2, 8, 9, 10
 LIMIT = 1 << 20
 QUIET_S = 0.03
-"""For an answer to bytes that may be no frame."""
+"""Timeout for the answer to bytes that may not be a frame [s]."""
 ODD_TEXTS = (
     "", "{", "[]", "7", "null", '{"type":"hello","token":"\\ud800"}', "[" * 100_000, "\x00",
     '{"a":' * 50_000, '{"type":"hello","token":' + "9" * 5000 + "}", '"\\u0000"', "\U0010ffff",

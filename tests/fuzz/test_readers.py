@@ -1,8 +1,8 @@
 """Every reader refuses damaged files with its documented errors, within limits of time and memory.
 
-``REAL2SIM_FUZZ_INPUTS`` (default 2000 per reader) sets the number of inputs,
-``REAL2SIM_FUZZ_SEED`` (default 0) the seed, and ``REAL2SIM_FUZZ_CORPUS`` the folder that keeps
-inputs of interest between runs.
+``REAL2SIM_FUZZ_INPUTS`` (default 2000 per reader) sets the number of inputs, ``REAL2SIM_FUZZ_SEED``
+(default 0) the seed, and ``REAL2SIM_FUZZ_CORPUS`` the folder that keeps inputs of interest between
+runs.
 """
 
 from __future__ import annotations

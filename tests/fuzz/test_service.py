@@ -1,9 +1,8 @@
 """The worker refuses damaged requests and messages without affecting other clients.
 
 Each target runs in its own process with a memory limit of 2 GiB. The worker may only give
-documented
-answers, log no errors, and never hang. A session driven during the attack must not be affected.
-``REAL2SIM_FUZZ_INPUTS`` (default 3000 per target) sets the number of inputs and
+documented answers, log no errors, and never hang. A session driven during the attack must not be
+affected. ``REAL2SIM_FUZZ_INPUTS`` (default 3000 per target) sets the number of inputs and
 ``REAL2SIM_FUZZ_SEED`` (default 0) the seed.
 """
 
@@ -18,8 +17,7 @@ import pytest
 
 FOLDER = Path(__file__).parent
 WAYS = ("routes", "requests", "uploads", "drive", "view", "frames")
-"""Damaged calls, damaged bytes of requests, forms with files, messages of the sockets, and bytes
-of handshakes and frames."""
+"""Targets: calls, raw request bytes, uploads, socket messages, and handshake and frame bytes."""
 
 pytestmark = [pytest.mark.network, pytest.mark.usefixtures("worker_kernels")]
 

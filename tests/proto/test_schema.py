@@ -34,8 +34,7 @@ def test_every_schema_is_valid_json_schema():
 
 
 def validator(name: str) -> jsonschema.Draft202012Validator:
-    """A validator for users of the schema folder: references point to files next to the
-    referring one."""
+    """A validator as used with the schema folder, where references point to sibling files."""
     files = {f"{name}.json": referencing.Resource.from_contents(s) for name, s in made().items()}
     registry = referencing.Registry().with_resources(files.items())
     return jsonschema.Draft202012Validator(made()[name], registry=registry)

@@ -43,10 +43,7 @@ def compile_protos(checkout: Path, folder: Path) -> None:
 
 
 def leave_out() -> None:
-    """Replace modules that the service imports but this drive does not need. Implements only the
-    yaw of
-    a quaternion.
-    """
+    """Replace modules that this drive does not need. Only implements the yaw of a quaternion."""
     unused = {
         "pygame": [],
         "vam.action_expert": ["VideoActionModelInference"],

@@ -30,8 +30,7 @@ class Driver:
     """Drives straight along x of its local frame, and records all requests.
 
     Refuses the same requests as NVIDIA's service: sessions without its cameras, images of other
-    cameras,
-    and with rectification, images of cameras that are not f-theta.
+    cameras, and with rectification, images of cameras that are not f-theta.
     """
 
     def __init__(self):

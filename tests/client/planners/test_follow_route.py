@@ -162,6 +162,6 @@ def test_braking_limits_are_the_highest_reachable_speeds(values, braking):
 
 
 @pytest.mark.parametrize("options", [{"speed": 0.0}, {"spacing": 0.0}, {"spacing": 4.0}])
-def test_settings_without_a_plan_are_refused(options):
+def test_invalid_speed_or_spacing_is_refused(options):
     with pytest.raises(ValueError, match="give a speed above 0"):
         FollowRoute(**options)

@@ -62,6 +62,6 @@ def test_the_plan_is_longer_behind_a_moving_leader():
 @pytest.mark.parametrize(
     "given", [{"speed": 0.0}, {"spacing": 0.0}, {"horizon": 0.2, "spacing": 0.25}]
 )
-def test_settings_without_a_plan_are_refused(planner, given):
+def test_invalid_speed_or_spacing_is_refused(planner, given):
     with pytest.raises(ValueError, match="give a speed above 0 and a spacing"):
         planner(**given)

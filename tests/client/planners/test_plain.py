@@ -15,7 +15,7 @@ from . import plain
 from .road import agent, observation
 
 TOLERANCE = 1e-9
-"""Of positions and headings, [m] and [rad]: sums are taken in another order."""
+"""For positions [m] and headings [rad], because the order of summation differs."""
 DELAYS = delays_of_poses(speed=8.0, horizon=3.0, spacing=0.25)
 
 bends = st.floats(-0.08, 0.08)

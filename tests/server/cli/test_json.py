@@ -24,7 +24,7 @@ MADE = {
     "run": "gallery:ccrs --seconds 1 --save {episode} --scene-out {flat}",
     "export": "{tiny} --out {splats} --object car_red",
 }
-"""What others read; in this order."""
+"""Commands whose output is read by others, in order."""
 COMMANDS = {
     **MADE,
     "log-info": "{log} --check",

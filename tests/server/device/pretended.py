@@ -24,16 +24,16 @@ _setup_privateuseone_for_python_backend("pretended")
 DEVICE = torch.device("pretended:0")
 
 TAKES_BOTH = {aten.copy_.default, aten._to_copy.default}
-"""Operations that may meet tensors of two devices."""
+"""Operations that accept tensors of two devices."""
 INDEXED = {aten.index.Tensor, aten.index_put.default, aten.index_put_.default}
-"""Indices may lie on the CPU where what they index lies on the device."""
+"""CPU indices are allowed for tensors on the device."""
 WAITING = {aten.nonzero.default, aten._unique2.default, aten.masked_select.default}
 VIEWS = ("view", "slice", "select", "transpose", "t.default", "permute", "squeeze", "expand")
 VIEWS += ("detach", "alias", "as_strided", "split", "unbind", "diagonal", "lift_fresh", "unfold")
 
 
 FACTORIES = ("tensor", "as_tensor", "eye", "arange", "linspace")
-"""torch fills these tensors, or gives them their size, where no operation can be seen."""
+"""torch creates these tensors without a visible operation."""
 
 
 @dataclass

@@ -1,5 +1,4 @@
-"""A serving frame needs a constant number of launches, copies and waits, whatever the world
-contains."""
+"""The number of launches, copies and waits per serving frame does not depend on the world."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""A complete worker on the pretended device (scenes, edits, sessions, images) against the
-reference."""
+"""A complete worker on the pretended device against the reference."""
 
 from __future__ import annotations
 

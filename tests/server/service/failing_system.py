@@ -188,10 +188,7 @@ READ_ONLY, NO_SPACE, BROKEN = errno.EROFS, errno.ENOSPC, errno.EIO
 
 
 def failing_system(folder: Path, place: Path) -> FailingSystem:
-    """A failing system for workers with state in ``folder``, built in ``place``. Skips if there is
-    no
-    compiler.
-    """
+    """A failing system for state in ``folder``, built in ``place``. Skips without a compiler."""
     compiler = shutil.which("cc")
     if compiler is None:
         pytest.skip("needs a C compiler")

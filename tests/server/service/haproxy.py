@@ -1,6 +1,5 @@
 """HAProxy in front of several workers, from the system package, configured by
-``docker/haproxy.cfg``.
-"""
+``docker/haproxy.cfg``."""
 
 from __future__ import annotations
 

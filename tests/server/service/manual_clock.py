@@ -12,7 +12,7 @@ from real2sim_server.service import clock
 from tests.waiting import wait_until
 
 SOON_S = 1.0
-"""What is due within this time is what a test waits for; a worker's own rounds come later."""
+"""Tests wait for sleepers due within this time [s]. Periodic work of a worker is due later."""
 
 
 class ManualClock:

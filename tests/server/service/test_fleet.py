@@ -1,7 +1,5 @@
 """Several workers on one store. A session continues on another worker when its own is gone, and
-runs on
-one worker only. A request to the wrong worker gets a retryable error.
-"""
+runs on one worker only. A request to the wrong worker gets a retryable error."""
 
 from __future__ import annotations
 
@@ -20,7 +18,7 @@ from .test_accounts import bearer
 from .test_trouble import Site
 
 LEASE_S = 300.0
-"""Longer than any test: a lease runs out where a test lets it, by :func:`put_to_sleep`."""
+"""Longer than any test. A lease only expires through :func:`put_to_sleep` [s]."""
 
 
 @pytest.fixture

@@ -1,7 +1,5 @@
 """Consistency of edits and steps written by many clients through the proxy while workers are
-killed.
-Every acknowledged write is stored exactly once.
-"""
+killed. Every acknowledged write is stored exactly once."""
 
 from __future__ import annotations
 
@@ -27,11 +25,11 @@ pytestmark = [pytest.mark.network, pytest.mark.slow]
 WRITES = int(os.environ.get("REAL2SIM_TEST_WRITES", "600"))
 SCENARIOS, SESSIONS, CLIENTS, KILLS = 3, 4, 8, 3
 GIVE_UP = 0.05
-"""Share of writes whose client asks once and never learns what came of it."""
+"""Share of writes that are sent once, without reading the answer."""
 
 
 COMES_AGAIN = (409, 412, 429, 502, 503, 504)
-"""Answers after which the same request may be sent again."""
+"""Statuses after which a request is retried."""
 
 
 @dataclass
@@ -129,9 +127,7 @@ class Site:
 
 def check(name: str, found: list[tuple[int, int]], history: History) -> None:
     """Check that each acknowledged write is stored once at its reported position, that no unknown
-    mark
-    is stored, and that positions are contiguous.
-    """
+    mark is stored, and that positions are contiguous."""
     told = history.acknowledged[name]
     times = Counter(mark for mark, _ in found)
     assert not [mark for mark, many in times.items() if many > 1], "written twice"

@@ -1,7 +1,5 @@
 """Three workers, HAProxy and PostgreSQL. Workers are killed or stopped during drives, and every
-session
-continues elsewhere, bit for bit.
-"""
+session continues elsewhere, bit for bit."""
 
 from __future__ import annotations
 
@@ -158,9 +156,7 @@ def test_a_worker_paused_for_ten_seconds_is_fenced_off(fleet, undisturbed):
 @pytest.mark.timeout(3600)
 def test_a_rolling_restart_does_not_affect_planners(fleet, undisturbed):
     """Workers are stopped and restarted one after the other during drives. Every drive is identical
-    and
-    no error reaches its planner.
-    """
+    and no error reaches its planner."""
     over, restarted = threading.Event(), []
 
     def restart_in_turn() -> None:

@@ -33,7 +33,7 @@ async def render_unless_held(renderer, render_request, context):
 
 exports._render_frame = render_unless_held
 """
-"""Code for a worker, whose videos wait behind their first frame for as long as a file exists."""
+"""Worker code that pauses videos after their first frame while a file exists."""
 
 KILLS = 2
 MAX_BETWEEN = 6
@@ -41,8 +41,7 @@ MAX_BETWEEN = 6
 
 @pytest.fixture
 def start(scenes_dir, tmp_path):
-    """Start workers in their own processes on the same store. Each start kills the previous
-    worker."""
+    """Start workers in their own processes on the same store. Each start kills the previous worker."""
     worker = KillableWorker(
         scenes=scenes_dir,
         data=tmp_path / "data",

@@ -72,10 +72,7 @@ def hashed(obs: real2sim.Observation) -> str:
 
 
 def drive(workers: Workers, options: dict, *, kills: tuple[int, ...]) -> tuple[list[str], dict]:
-    """Hashes of all observations of a drive whose worker is killed after some steps, and statistics
-    of
-    the drive.
-    """
+    """Observation hashes and statistics of a drive whose worker is killed after some steps."""
     planner, session = Idm(speed=8.0), workers.client.session(scene="street").open()
     sensors = [{"camera": "front", "width": 64, "codec": "raw", "period_us": 500_000}]
     obs = session.reset(sensors=sensors, **options)

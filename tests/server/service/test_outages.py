@@ -1,7 +1,5 @@
 """Full or unwritable disks, clock shifts, and a database outage of half a minute. Each has a
-specific
-error, no data is lost, and the worker recovers without help.
-"""
+specific error, no data is lost, and the worker recovers without help."""
 
 from __future__ import annotations
 
@@ -29,7 +27,7 @@ pytestmark = pytest.mark.network
 
 OUTAGE_S, MIN_ROUNDS = 30.0, 20
 PATIENT = {"REAL2SIM_STORE_TIMEOUT_SECONDS": "60"}
-"""No disk that works is slower, however busy the machine is."""
+"""Slower than any working disk, even on a busy machine."""
 JOB = {"scene": "tiny", "camera": "front", "fps": 2, "width": 64}
 CUT = {"scene": "tiny", "object_id": "car_red"}
 
@@ -140,8 +138,7 @@ def test_a_clock_set_back_and_forth_by_an_hour_has_no_effect(apart, system):
 
 
 def rounds() -> Iterator[None]:
-    """Rounds of an outage, until it has lasted long enough and a minimum number of rounds has
-    passed."""
+    """Rounds of an outage, until it has lasted long enough with enough rounds."""
     began, count = time.monotonic(), 0
     while count < MIN_ROUNDS or time.monotonic() - began < OUTAGE_S:
         yield

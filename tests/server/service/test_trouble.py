@@ -1,7 +1,5 @@
 """Error responses during a full disk, a database outage, and a clock shift. Acknowledged writes
-survive
-and the worker recovers without help.
-"""
+survive and the worker recovers without help."""
 
 from __future__ import annotations
 

@@ -126,7 +126,7 @@ BEARER = {"Authorization": f"Bearer {TOKEN}"}
 VALID = {
     "expected-statuses": [200, 201, 202, 204, 304, 404, 406, 409, 410, 412, 413, 422, 429, 501, 503]
 }
-"""What a request that is valid by its schema may get: much can only be known from the scene."""
+"""Statuses allowed for requests that are valid by the schema. Some checks need the scene."""
 
 
 def examples(most: int) -> settings:
@@ -183,8 +183,7 @@ def test_random_requests_pass_all_schemathesis_checks(make_settings, made, most)
 def test_random_requests_on_existing_resources_get_documented_answers(
     make_settings, made, opened_by, most
 ):
-    """Requests use the ids of a running session and a scenario, with the worker's or session's
-    token."""
+    """With ids of a running session and a scenario, and the worker's or session's token."""
     schemathesis = pytest.importorskip(
         "schemathesis", reason="not installed: pip install 'real2sim[dev]'"
     )

@@ -22,7 +22,7 @@ from real2sim_server.service.http.openapi import operations, published
 
 TOKEN = "a long enough secret"
 STREAMS = ("jobs-events",)
-"""Answers that last as long as a job."""
+"""Calls whose response lasts as long as a job."""
 ENDS = (
     "sessions-delete",
     "storyboards-remove",
@@ -31,11 +31,11 @@ ENDS = (
     "jobs-cancel",
     "scenes-unload",
 )
-"""Called last: others need what they take away."""
+"""Called last, because they remove what others need."""
 FILES = {"@scenario.xosc": write_openscenario(corner_case("ccrb").storyboard())}
-"""What a caller has beside the shell."""
+"""Files used by the samples."""
 REFUSED = {400, 401, 403, 404, 405, 406, 410, 413, 415, 422}
-"""Statuses that say that the call itself was wrong."""
+"""Statuses that mean that the call itself was invalid."""
 OBJECTS = {"van_0": "car_red", "car_0": "car_blue", "car_3": "car_red", "car_6": "post"}
 
 

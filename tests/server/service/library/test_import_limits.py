@@ -20,8 +20,7 @@ MIB = 1024**2
 
 
 def many_splats(path: Path, count: int) -> Path:
-    """An spz file of ``count`` equal splats of degree 3, which compresses to a few bytes per
-    thousand."""
+    """An spz file of ``count`` equal splats of degree 3, a few bytes per thousand splats."""
     header = Header(3, count, 3, 12, 0)
     arrays = {name: np.zeros(n, np.uint8) for name, n in header.stream_sizes.items()}
     path.write_bytes(write_streams(header, Streams(**arrays)))

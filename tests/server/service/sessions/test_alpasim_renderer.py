@@ -34,7 +34,7 @@ pytestmark = pytest.mark.network
 
 PNG, JPEG, PLANAR, AV1 = 1, 2, 4, 6
 SHIFTED = np.array([[0.0, -1, 0, 5], [1, 0, 0, -3], [0, 0, 1, 2], [0, 0, 0, 1]])
-"""T_world_theirs of a scene whose other simulator counts in another world."""
+"""T_world_theirs of a scene for which the other simulator uses a different world frame."""
 LATER = 1_700_000_000_000_000
 
 

@@ -22,9 +22,7 @@ LATE = {"deadline_ms": 80}
 @pytest.fixture
 def episode(site):
     """Start an episode through the SDK. Keyword arguments go to ``reset``. Yields the SDK's
-    session, the
-    worker's session and the first observation.
-    """
+    session, the worker's session and the first observation."""
 
     @contextlib.contextmanager
     def begin(**spec) -> Iterator[tuple]:

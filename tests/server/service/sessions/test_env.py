@@ -54,7 +54,7 @@ def test_lidars_and_radars_are_arrays_of_points(site):
         assert made.observation_space.contains(obs)
         assert obs["vlp-16"].any()
         assert obs["corner"].shape == (256, 5)
-        # Every nth return, not the first ones.
+        # Evenly spaced returns, not the first ones.
         sweep = made.last.lidar("vlp-16")
         assert sweep.count > 64
         np.testing.assert_array_equal(

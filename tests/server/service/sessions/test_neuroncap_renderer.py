@@ -77,10 +77,7 @@ def drawn(site, **options):
 
 
 def alike(image, other) -> bool:
-    """Whether images are equal. A pose converted to a quaternion and back may shift the rounding of
-    a
-    pixel.
-    """
+    """Whether images are equal up to rounding errors of poses converted to quaternions."""
     return np.abs(image.astype(int) - other).mean() < 0.01
 
 

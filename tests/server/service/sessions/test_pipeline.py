@@ -15,7 +15,7 @@ pytestmark = pytest.mark.network
 
 CAMERA = {"camera": "front", "width": 160, "codec": "raw"}
 PHASES = re.findall(r"(?m)^``(\w+)``", pipeline.__doc__ or "")
-"""As the module's docstring states them."""
+"""From the docstring of the module."""
 
 
 @pytest.fixture

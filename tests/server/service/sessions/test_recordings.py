@@ -22,8 +22,7 @@ runner = CliRunner()
 @pytest.fixture
 def recorded(site, tmp_path):
     """Recording of an episode with a missed deadline, an edit and images. Also returns the last
-    observation and the result.
-    """
+    observation and the result."""
     with real2sim.connect(site.url) as client, client.session(scene="tiny") as session:
         session.reset(
             action="control",

@@ -1,7 +1,5 @@
 """A session moves to another worker only after its lease has expired. The previous worker can then
-no
-longer write to it.
-"""
+no longer write to it."""
 
 from __future__ import annotations
 
@@ -147,9 +145,7 @@ def test_logs_written_together_are_all_refused_if_one_was_taken_over(url, count)
 
 def test_a_concurrent_append_and_takeover_exclude_each_other(postgres):
     """With a database server both can run at once. Either the entry is in the log that is taken
-    over, or
-    it is refused.
-    """
+    over, or it is refused."""
     url = postgres.new_database()
 
     async def work(store):

@@ -206,7 +206,7 @@ def test_sqlite_keeps_temporary_data_in_memory(sqlite_url):
 
 
 NORMAL, FULL = 1, 2
-"""How SQLite names what it waits for: nothing at a commit, or the disk."""
+"""Values of SQLite's ``synchronous``: do not sync at a commit, or sync to disk."""
 
 
 @pytest.mark.parametrize(

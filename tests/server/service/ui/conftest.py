@@ -14,7 +14,7 @@ from real2sim_server.service.serve import RunningWorker, running_worker
 from .hands import STEP_MS, kept
 
 BROWSERS = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome")
-"""The lightest first."""
+"""Lightest first."""
 BROWSER = next(filter(None, map(shutil.which, BROWSERS)), "")
 
 

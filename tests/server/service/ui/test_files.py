@@ -9,7 +9,7 @@ import pytest
 from real2sim_server.service.routes.server import FOLDER, STUDIO
 
 OWN = sorted(name for name in STUDIO if not name.startswith("vendor/"))
-"""What is vendored is as its authors have published it."""
+"""Own files. Vendored files are unmodified."""
 MODULES = [name for name in OWN if name.endswith(".js")]
 IMPORT = re.compile(r'^import (?:\{([^}]*)\} )?from "\./([\w.]+)";', re.MULTILINE)
 EXPORT = re.compile(r"^export (?:async )?(?:function\*?|const|let|class) (\w+)", re.MULTILINE)

@@ -19,7 +19,7 @@ from .hands import drag, kept, shown
 
 pytestmark = [pytest.mark.browser, pytest.mark.network]
 MIN_PSNR = 38.0
-"""[dB]; 45 were seen."""
+"""[dB]. Measured: 45."""
 
 
 @pytest.fixture(scope="module")
