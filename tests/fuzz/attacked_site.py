@@ -1,4 +1,4 @@
-"""A worker under attack in this process, its resources, and a client that drives at the same time."""
+"""A worker under attack in this process, its resources, and a concurrent drive."""
 
 from __future__ import annotations
 

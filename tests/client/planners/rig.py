@@ -30,7 +30,7 @@ def camera_on_vehicle(degrees: float) -> np.ndarray:
 
 
 def seen(*, position=(100.0, 50.0, 2.0), yaw=30.0, **options):
-    """An observation with one image per camera in CAMERAS. The k-th image has grey level ``10 k``."""
+    """An observation with one image per camera. The k-th of CAMERAS has grey level ``10 k``."""
     T_world_ego = np.eye(4)
     T_world_ego[:3, :3], T_world_ego[:3, 3] = turned(yaw), position
     frames = {}

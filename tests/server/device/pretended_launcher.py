@@ -10,7 +10,7 @@ from . import pretended
 
 
 class OnPretended(KernelTwin):
-    """Runs kernels on the values of pretended tensors, and refuses other memory. Counts launches."""
+    """Runs kernels on the values of pretended tensors only. Counts launches."""
 
     def launch(self, kernel: str, blocks: int, space: int, argument: int = 0) -> None:
         pretended.counts.launches += 1

@@ -41,7 +41,7 @@ MAX_BETWEEN = 6
 
 @pytest.fixture
 def start(scenes_dir, tmp_path):
-    """Start workers in their own processes on the same store. Each start kills the previous worker."""
+    """Start workers in processes on the same store. Each start kills the previous worker."""
     worker = KillableWorker(
         scenes=scenes_dir,
         data=tmp_path / "data",

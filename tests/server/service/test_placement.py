@@ -24,7 +24,7 @@ READY = "up ready 100%"
 
 
 class Stand:
-    """Stands in for a worker. Answers with its name, and reports a configurable state to its proxy."""
+    """A fake worker that answers with its name and reports a configurable state to its proxy."""
 
     def __init__(self, name: str) -> None:
         stand = self

@@ -1,4 +1,4 @@
-"""Log entries of several sessions share a transaction. A failure of one does not affect the others."""
+"""Log entries of several sessions share a transaction. One failure does not affect the others."""
 
 from __future__ import annotations
 
