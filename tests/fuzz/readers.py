@@ -1,5 +1,4 @@
-"""Fuzz targets for all file readers: valid small samples, how to read them, and their documented
-errors.
+"""Fuzz targets for all file readers: valid samples, how to read them, and documented errors.
 
 A sample consists of named parts: the file itself, or the content of an archive, a compressed stream
 or a folder. Parts are damaged and then reassembled, so that checksums of the container do not hide
