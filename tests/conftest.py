@@ -1,4 +1,4 @@
-"""Fixtures that all tests share."""
+"""Fixtures shared by all tests."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, settings
 
-import real2sim_server  # noqa: F401 - says how threads wait, before any library starts some
+import real2sim_server  # noqa: F401 - sets the waiting policy of threads, before any library starts some
 from scripts.compile_kernels import compile_drawing, compile_physics
 from tests.pages import Page
 
-# Machines under load are slow now and then, and a failure must come back on the next run.
+# Machines under load are sometimes slow, and a failure must be reproduced by the next run.
 settings.register_profile(
     "repeatable",
     deadline=None,
@@ -41,7 +41,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 @pytest.fixture(scope="session")
 def test_data() -> Path:
-    """Folder of real sample data; tests that need it skip where it is absent."""
+    """Folder of real sample data. Tests that need it are skipped without it."""
     folder = Path(os.environ.get("REAL2SIM_TEST_DATA", REPOSITORY.parent / "shared" / "data"))
     if not folder.is_dir():
         pytest.skip(f"no real test data at {folder} (set REAL2SIM_TEST_DATA)")
@@ -50,14 +50,14 @@ def test_data() -> Path:
 
 @pytest.fixture(scope="session")
 def compile_alone(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Callable[[], None]], None]:
-    """Runs a function that compiles kernels, once in all processes of this run.
+    """Run a function that compiles kernels in only one process of this run.
 
-    The others wait and load from disk what is left there. Time limits are of tests and not of their
-    fixtures, so no test fails because it waits.
+    The other processes wait and load the result from disk. Time limits apply to tests, not to
+    fixtures, so waiting does not fail a test.
     """
     folder = tmp_path_factory.getbasetemp()
     if "PYTEST_XDIST_WORKER" in os.environ:
-        folder = folder.parent  # That of all processes.
+        folder = folder.parent  # Shared by all processes.
 
     def locked(kernels: Callable[[], None]) -> None:
         with (folder / "compiling.lock").open("w") as lock:
@@ -72,18 +72,18 @@ def compile_alone(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Callabl
 
 @pytest.fixture(scope="session")
 def worker_kernels(compile_alone: Callable[[Callable[[], None]], None]) -> None:
-    """Kernels that a worker needs before it is ready, on disk."""
+    """Cache the kernels that a worker needs before it is ready."""
     compile_alone(compile_drawing)
 
 
 @pytest.fixture(scope="session")
 def solver_kernels(compile_alone: Callable[[Callable[[], None]], None]) -> None:
-    """Kernels of the physics on the CPU, in both precisions, on disk."""
+    """Cache the CPU physics kernels in both precisions."""
     compile_alone(compile_physics)
 
 
 @pytest.fixture
 def page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Page]:
-    """Opens a page of README and docs, to run its blocks in an empty folder."""
+    """Open a page of README or docs, to run its blocks in an empty folder."""
     monkeypatch.chdir(tmp_path)
     return lambda name: Page(REPOSITORY / name, tmp_path)

@@ -1,4 +1,4 @@
-"""The code blocks of README and docs, for tests that run them in the order of their page."""
+"""Code blocks of README and docs, for tests that run them in page order."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ PACKAGES = ("proto", "client", "server")
 
 @dataclass
 class Page:
-    """The blocks of a page, in order; Python shares its names, and shells their variables."""
+    """The blocks of a page, in order. Python blocks share names, shell blocks share variables."""
 
     path: Path
     folder: Path
@@ -37,7 +37,7 @@ class Page:
             assert self._blocks == [], "blocks that no test runs"
 
     def block(self, words: str) -> str:
-        """The next block, which must have these words in it."""
+        """The next block, which must contain these words."""
         _, text = self._blocks.pop(0)
         assert words in text
         return text
@@ -46,12 +46,12 @@ class Page:
         return json.loads(self.block(words))
 
     def python(self, words: str, **instead: str) -> dict[str, Any]:
-        """Run the next block; the names of the page after it."""
+        """Run the next block. Returns the names defined so far."""
         exec(replaced(self.block(words), instead), self.names)
         return self.names
 
     def shell(self, words: str, instead: dict[str, str] | None = None) -> str:
-        """Run the next block; what it prints. The first command that fails ends it."""
+        """Run the next block. Returns its output. Stops at the first failing command."""
         text = replaced(self.block(words), instead or {})
         script = f"set -aeo pipefail\n. ./state\n{text}\n{{ export -p; declare -f; }} > state"
         environment = os.environ | {
@@ -67,7 +67,7 @@ class Page:
 
 
 def replaced(text: str, instead: dict[str, str]) -> str:
-    """The text with addresses and sizes of the test; each of them must be in it."""
+    """Replace addresses and sizes by those of the test. Each of them must occur."""
     for old, new in instead.items():
         assert old in text
         text = text.replace(old, new)

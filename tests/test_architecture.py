@@ -1,6 +1,6 @@
-"""The architecture, as a test: who may import whom.
+"""Import rules between packages.
 
-``ARCHITECTURE.md`` draws the same layers for people.
+``ARCHITECTURE.md`` shows the same layers.
 """
 
 from __future__ import annotations
@@ -52,21 +52,21 @@ LAYERS = (
     "learning",
     "cli",
 )
-"""Packages and single modules of the server, lowest first: each imports only those before it."""
+"""Packages and modules of the server, lowest first. Each imports only earlier ones."""
 
 PLAY_THEIR_OWN_USER = {"demo", "policies", "sweeps", "cli"}
-"""Only these use the client SDK, since there the program plays its own user."""
+"""Only these import the client SDK, because they act as clients of a worker."""
 
 FORBIDDEN = {
     "real2sim_proto": {"real2sim", SERVER, "torch", "fastapi", "numba", "cv2"},
     "real2sim": {SERVER, "torch", "fastapi", "numba"},
 }
-"""What a distribution's contract and SDK never import, at the top of a file or inside."""
+"""Imports forbidden in the protocol and the SDK, at any level of a file."""
 
 
 @cache
 def modules() -> dict[str, Path]:
-    """Every module of the three packages by its dotted name; a package stands for its __init__."""
+    """All modules of the three packages by dotted name. A package stands for its __init__."""
     found = {}
     for name, root in ROOTS.items():
         for path in sorted(root.rglob("*.py")):
@@ -78,16 +78,16 @@ def modules() -> dict[str, Path]:
 
 @cache
 def imports(module: str) -> frozenset[str]:
-    """What a module imports, anywhere in it: modules of the project, others by their full name."""
+    """Imports of a module, anywhere in it: project modules, and the full names of others."""
     path = modules()[module]
     package = module if path.name == "__init__.py" else module.rpartition(".")[0]
     return imported_by(path.read_text(encoding="utf-8"), package)
 
 
 def imported_by(source: str, package: str) -> frozenset[str]:
-    """What a file of ``package`` with the text ``source`` imports.
+    """Imports of a file of ``package`` with the text ``source``.
 
-    ``from . import x`` and ``from package import x`` count as the module ``x`` where there is one.
+    ``from . import x`` and ``from package import x`` count as module ``x`` if it exists.
     """
     names: set[str] = set()
     parts = package.split(".")
@@ -103,7 +103,7 @@ def imported_by(source: str, package: str) -> frozenset[str]:
 
 
 def layer(module: str) -> str:
-    """The package or single module right below ``real2sim_server`` that a module belongs to."""
+    """The package or module directly below ``real2sim_server`` that contains a module."""
     return module.split(".")[1]
 
 
@@ -112,14 +112,14 @@ def server_modules() -> list[str]:
 
 
 def service_order() -> list[str]:
-    """Parts of the service, lowest first, as its docstring states them."""
+    """Parts of the service, lowest first, from its docstring."""
     source = modules()[f"{SERVER}.service"].read_text(encoding="utf-8")
     stated = re.findall(r"(?m)^- (``.*?):", ast.get_docstring(ast.parse(source)) or "")
     return [name for line in stated for name in re.findall(r"``(\w+)``", line)]
 
 
 def circle(edges: dict[str, set[str]]) -> list[str]:
-    """Names along one circle of the graph; empty where there is none."""
+    """Names along one cycle of the graph, or empty if there is none."""
     try:
         TopologicalSorter(edges).prepare()
     except CycleError as error:
@@ -127,13 +127,13 @@ def circle(edges: dict[str, set[str]]) -> list[str]:
     return []
 
 
-def test_the_layers_are_the_packages_that_exist():
+def test_the_layers_cover_all_packages():
     there = {layer(name) for name in server_modules()}
     assert there == set(LAYERS)
 
 
 @pytest.mark.parametrize("name", LAYERS)
-def test_a_package_imports_only_packages_below_it(name):
+def test_a_package_imports_only_lower_packages(name):
     above = set(LAYERS[LAYERS.index(name) + 1 :])
     wrong = [
         f"{module} imports {imported}"
@@ -145,7 +145,7 @@ def test_a_package_imports_only_packages_below_it(name):
     assert not wrong
 
 
-def test_no_files_import_each_other_in_a_circle():
+def test_modules_have_no_import_cycles():
     edges = {m: {i for i in imports(m) if i in modules() and i != m} for m in modules()}
     assert not circle(edges)
 
@@ -153,7 +153,7 @@ def test_no_files_import_each_other_in_a_circle():
 @pytest.mark.parametrize(
     "package", ["physics", "reconstruct", "render", "scene", "service", "world"]
 )
-def test_folders_of_a_package_import_each_other_in_no_circle(package):
+def test_folders_of_a_package_have_no_import_cycles(package):
     prefix = f"{SERVER}.{package}."
     edges: dict[str, set[str]] = {}
     for module in server_modules():
@@ -175,7 +175,7 @@ def test_the_service_lists_every_part():
 
 
 @pytest.mark.parametrize("part", service_order())
-def test_a_part_of_the_service_imports_only_those_before_it(part):
+def test_a_part_of_the_service_imports_only_lower_parts(part):
     order = service_order()
     allowed = {*order[: order.index(part) + 1]}
     prefix = f"{SERVER}.service."
@@ -190,7 +190,7 @@ def test_a_part_of_the_service_imports_only_those_before_it(part):
 
 
 @pytest.mark.parametrize("package", FORBIDDEN)
-def test_contract_and_sdk_import_nothing_of_the_worker(package):
+def test_protocol_and_sdk_do_not_import_the_worker(package):
     wrong = [
         f"{module} imports {imported}"
         for module in modules()
@@ -201,7 +201,7 @@ def test_contract_and_sdk_import_nothing_of_the_worker(package):
     assert not wrong
 
 
-def test_the_worker_uses_the_sdk_only_where_it_plays_its_own_user():
+def test_only_packages_that_act_as_clients_import_the_sdk():
     wrong = [
         f"{module} imports {imported}"
         for module in server_modules()
@@ -212,7 +212,7 @@ def test_the_worker_uses_the_sdk_only_where_it_plays_its_own_user():
     assert not wrong
 
 
-def test_every_package_says_what_it_is():
+def test_every_package_has_a_docstring():
     silent = [
         name
         for name, path in modules().items()
@@ -232,5 +232,5 @@ def test_every_package_says_what_it_is():
         "def later():\n    from .. import world",
     ],
 )
-def test_every_way_to_import_a_package_is_seen(statement):
+def test_every_form_of_import_is_recognised(statement):
     assert f"{SERVER}.world" in imported_by(statement, f"{SERVER}.edit")

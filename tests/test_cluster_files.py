@@ -1,4 +1,4 @@
-"""Files that deploy a fleet: what they promise, and the schemas that they have to keep."""
+"""Deployment files of a fleet: their schemas and guarantees."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def cluster() -> dict:
 
 
 @pytest.mark.parametrize("name", ["compose.yml", "compose.gpu.yml", "compose.cluster.yml"])
-def test_a_compose_file_keeps_the_schema(name):
+def test_a_compose_file_is_valid(name):
     jsonschema = pytest.importorskip("jsonschema")
     checker = pytest.importorskip("check_jsonschema", reason="pip install 'real2sim[dev]'")
     folder = Path(checker.__file__).parent / "builtin_schemas" / "vendor"
@@ -50,7 +50,7 @@ def test_a_compose_file_keeps_the_schema(name):
     jsonschema.Draft7Validator(schema).validate(document)
 
 
-def test_kubernetes_takes_every_manifest():
+def test_kubernetes_manifests_are_valid():
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         validating = pytest.importorskip(
@@ -61,7 +61,7 @@ def test_kubernetes_takes_every_manifest():
             validating.validate(manifest, version, strict=True)
 
 
-def test_the_overlay_for_gpus_patches_what_is_there():
+def test_the_gpu_overlay_applies_to_the_base():
     overlay = yaml.safe_load((KUBERNETES / "gpu" / "kustomization.yaml").read_text())
     (patch,) = overlay["patches"]
     (worker,) = (
@@ -81,7 +81,7 @@ def test_the_overlay_for_gpus_patches_what_is_there():
     assert container["resources"]["limits"]["nvidia.com/gpu"] == 1
 
 
-def test_kustomizations_name_files_that_are_there():
+def test_kustomizations_name_existing_files():
     for folder in (KUBERNETES, KUBERNETES / "base", KUBERNETES / "gpu"):
         kustomization = yaml.safe_load((folder / "kustomization.yaml").read_text())
         files = [f for g in kustomization.get("configMapGenerator", ()) for f in g["files"]]
@@ -89,7 +89,7 @@ def test_kustomizations_name_files_that_are_there():
 
 
 @pytest.mark.parametrize("folder", [KUBERNETES, KUBERNETES / "gpu"], ids=["cpu", "gpu"])
-def test_kustomize_builds_manifests_that_kubernetes_takes(folder):
+def test_kustomize_builds_valid_manifests(folder):
     kubectl = shutil.which("kubectl")
     if kubectl is None:
         pytest.skip("there is no kubectl")
@@ -110,18 +110,18 @@ def test_kustomize_builds_manifests_that_kubernetes_takes(folder):
     assert {manifest["metadata"]["namespace"] for manifest in found} == {"real2sim"}
 
 
-def test_an_overlay_lies_beside_what_it_builds_on():
-    """kustomize takes no folder that holds the one that names it."""
+def test_an_overlay_is_not_inside_its_base():
+    """kustomize refuses a base folder that contains the overlay."""
     for folder in (KUBERNETES, KUBERNETES / "gpu"):
         kustomization = yaml.safe_load((folder / "kustomization.yaml").read_text())
         for name in kustomization["resources"]:
             assert not folder.resolve().is_relative_to((folder / name).resolve())
 
 
-# --- promises ---------------------------------------------------------------------------
+# --- guarantees -------------------------------------------------------------------------
 
 
-def test_nothing_in_the_cluster_is_root_or_writes_beside_its_volumes(cluster):
+def test_containers_are_unprivileged_with_read_only_roots(cluster):
     for name, service in cluster["services"].items():
         assert service["read_only"] is True, name
         assert service["cap_drop"] == ["ALL"], name
@@ -138,7 +138,7 @@ def test_nothing_in_the_cluster_is_root_or_writes_beside_its_volumes(cluster):
             assert container["resources"]["limits"]["memory"]
 
 
-def test_only_the_proxy_is_reached_from_outside_and_by_tls(cluster):
+def test_only_the_proxy_is_exposed_and_uses_tls(cluster):
     published = {n: s["ports"] for n, s in cluster["services"].items() if "ports" in s}
     assert set(published) == {"proxy", "grafana"}
     assert published["proxy"] == ["${REAL2SIM_ADDRESS:-127.0.0.1}:8443:8443"]
@@ -146,7 +146,7 @@ def test_only_the_proxy_is_reached_from_outside_and_by_tls(cluster):
     assert "bind :8443 ssl" in (DOCKER / "haproxy.cfg").read_text()
 
 
-def test_workers_are_alike_but_for_their_names_and_folders(cluster):
+def test_workers_differ_only_in_names_and_folders(cluster):
     workers = {n: s for n, s in cluster["services"].items() if n.startswith("worker")}
     names = {s["environment"]["REAL2SIM_WORKER_ID"] for s in workers.values()}
     assert names == {"w0", "w1", "w2"}
@@ -158,7 +158,7 @@ def test_workers_are_alike_but_for_their_names_and_folders(cluster):
         assert int(service["stop_grace_period"].rstrip("s")) > drained
 
 
-def test_settings_that_are_given_exist(cluster):
+def test_all_used_settings_exist(cluster):
     given = {v for s in cluster["services"].values() for v in s.get("environment", {})}
     given |= {
         e["name"]
@@ -171,7 +171,7 @@ def test_settings_that_are_given_exist(cluster):
     assert {name for name in given if name.startswith("REAL2SIM_")} <= known
 
 
-def test_the_proxy_of_kubernetes_is_the_same_but_for_addresses():
+def test_the_kubernetes_proxy_has_the_same_rules_as_the_compose_proxy():
     def rules(path: Path) -> list[str]:
         text = path.read_text()
         lines = text[text.index("global\n") :].splitlines()
@@ -192,14 +192,14 @@ def test_kubernetes_waits_for_a_worker_to_hand_over():
     }
 
 
-def test_the_dashboard_and_the_autoscaler_ask_for_metrics_that_there_are():
+def test_dashboard_and_autoscaler_use_existing_metrics():
     names = {
         sample
         for family in Metrics().registry.collect()
         for suffix in ("", "_total", "_bucket", "_count", "_sum")
         for sample in (family.name + suffix,)
     }
-    # Those of tokens are there once there are accounts.
+    # Token metrics only exist once there are accounts.
     names |= {"real2sim_token_requests_total", "real2sim_token_refusals_total"}
     dashboard = json.loads((DOCKER / "grafana" / "real2sim.json").read_text())
     asked = {
@@ -214,7 +214,7 @@ def test_the_dashboard_and_the_autoscaler_ask_for_metrics_that_there_are():
     assert asked <= names
 
 
-def test_the_proxy_takes_a_certificate_that_it_is_given(tmp_path, monkeypatch):
+def test_the_proxy_configuration_accepts_a_certificate(tmp_path, monkeypatch):
     from .server.service.haproxy import program
 
     haproxy = program()

@@ -1,4 +1,4 @@
-"""What the container files promise, as far as it can be read off them."""
+"""Guarantees that can be read from the container files."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def worker(compose):
 
 
 def filled_in(text: str, **variables: str) -> str:
-    """What compose makes of ``${NAME:-default}`` and ``${NAME:?message}``."""
+    """Substitute ``${NAME:-default}`` and ``${NAME:?message}`` as compose does."""
 
     def value(found: re.Match[str]) -> str:
         name, kind, otherwise = found.groups()
@@ -48,13 +48,13 @@ def filled_in(text: str, **variables: str) -> str:
 
 
 def mounts(worker, **variables: str) -> dict[str, str]:
-    """Volume or folder of each place in the container."""
+    """Volume or folder mounted at each path of the container."""
     pairs = [filled_in(volume, **variables).split(":") for volume in worker["volumes"]]
     return {place: source for source, place in pairs}
 
 
-def test_a_fresh_clone_needs_no_folder_and_its_worker_can_write_to_all_it_mounts(compose, worker):
-    """Docker gives a new volume the owner that its place has in the image; a folder is root's."""
+def test_mounts_are_volumes_that_the_worker_can_write(compose, worker):
+    """A new Docker volume gets the owner of its path in the image. Bind mounts belong to root."""
     volumes = mounts(worker)
     assert set(volumes.values()) <= compose["volumes"].keys()
     owned = re.findall(
@@ -63,28 +63,28 @@ def test_a_fresh_clone_needs_no_folder_and_its_worker_can_write_to_all_it_mounts
     assert volumes.keys() <= set(owned[0].split())
 
 
-def test_scenes_can_be_a_folder_of_ones_own(worker):
+def test_scenes_can_be_a_folder_of_the_host(worker):
     assert mounts(worker, REAL2SIM_SCENES="/data/scenes")["/scenes"] == "/data/scenes"
 
 
-def test_a_worker_writes_nowhere_but_to_its_volumes(worker):
+def test_a_worker_can_only_write_to_its_volumes_and_tmp(worker):
     assert worker["read_only"] is True
     assert [place.split(":")[0] for place in worker["tmpfs"]] == ["/tmp"]
 
 
-def test_a_worker_has_no_capabilities_and_gets_none(worker):
+def test_a_worker_has_no_capabilities(worker):
     assert worker["cap_drop"] == ["ALL"]
     assert "no-new-privileges:true" in worker["security_opt"]
 
 
-def test_what_a_worker_takes_is_limited(worker):
+def test_a_worker_has_resource_limits(worker):
     assert worker["mem_limit"]
     assert worker["pids_limit"] <= 1024
     assert set(worker["logging"]["options"]) == {"max-size", "max-file"}
 
 
 @pytest.mark.parametrize("name", IMAGES)
-def test_an_image_runs_as_a_user_whose_number_shows_that_it_is_not_root(name):
+def test_an_image_runs_as_a_numeric_non_root_user(name):
     lines = (DOCKER / name).read_text().splitlines()
     users = [line.split()[1] for line in lines if line.startswith("USER ")]
     assert users == ["10001:10001"]
@@ -92,22 +92,22 @@ def test_an_image_runs_as_a_user_whose_number_shows_that_it_is_not_root(name):
 
 
 @pytest.mark.parametrize("name", IMAGES)
-def test_an_image_is_built_only_if_no_kernel_is_left_to_compile(name):
+def test_an_image_build_fails_if_kernels_are_left_to_compile(name):
     assert "real2sim doctor --warm && real2sim doctor --warmed" in (DOCKER / name).read_text()
 
 
-def test_the_image_for_gpus_is_built_only_if_cuda_is_usable_but_for_the_device():
+def test_the_gpu_image_build_requires_cuda_except_for_the_device():
     text = (DOCKER / "Dockerfile.gpu").read_text()
     assert "real2sim doctor --build-gpu" in text
     build, check = text.index("doctor --build-gpu"), text.index("doctor --need-cuda")
     assert build < check
     assert "doctor --need-cuda --without-device" in text
-    # It would otherwise draw on the CPU where the device cannot be had, and say so in the log only.
+    # Otherwise a worker without a device would render on the CPU and only log it.
     assert "REAL2SIM_BACKEND=cuda" in text
 
 
 @pytest.mark.parametrize("name", IMAGES)
-def test_an_image_can_share_a_database_server(name):
+def test_an_image_supports_postgresql(name):
     assert re.search(r"'(?:\.|real2sim)\[.*postgres.*\]'", (DOCKER / name).read_text())
 
 
@@ -119,13 +119,13 @@ def pins(path: Path) -> dict[str, str]:
 IMAGE_PINS = DOCKER / "requirements.txt"
 
 
-def test_an_image_installs_only_what_is_pinned_with_a_hash():
+def test_an_image_installs_only_packages_with_a_hash():
     requirements = re.split(r"(?m)^(?=[A-Za-z])", IMAGE_PINS.read_text())[1:]
     assert len(requirements) > 40
     assert [r.split()[0] for r in requirements if "--hash=sha256:" not in r] == []
 
 
-def test_an_image_has_the_versions_that_are_tested():
+def test_an_image_has_the_tested_versions():
     tested = pins(DOCKER.parent / "constraints.txt")
     elsewhere = re.findall(
         r"(?m)^(\S+)==.* sys_platform == '(?:win32|emscripten)' \\$", IMAGE_PINS.read_text()
@@ -134,7 +134,7 @@ def test_an_image_has_the_versions_that_are_tested():
     assert {name: v for name, v in image.items() if tested.get(name) != v} == {}
 
 
-def test_whatever_a_worker_needs_is_pinned_for_images():
+def test_all_requirements_of_a_worker_are_pinned_for_images():
     folders = (DOCKER.parent / "client", DOCKER.parent)
     sdk, project = (tomllib.loads((f / "pyproject.toml").read_text())["project"] for f in folders)
     extras = project["optional-dependencies"] | {"server": sdk["dependencies"]}
@@ -148,17 +148,17 @@ def test_whatever_a_worker_needs_is_pinned_for_images():
     assert names - pins(IMAGE_PINS).keys() <= set(with_torch[1].split())
 
 
-def test_everything_in_an_image_is_among_the_notices():
+def test_all_packages_of_an_image_are_in_the_third_party_notices():
     rows = (DOCKER.parent / "THIRD_PARTY.md").read_text()
     missing = [n for n, v in pins(IMAGE_PINS).items() if f"| {n} | {v} |" not in rows]
     assert missing == []
 
 
-# --- these files at work ----------------------------------------------------------------
+# --- running the files ------------------------------------------------------------------
 
 
 def last_stage(name: str) -> dict[str, str]:
-    """Instructions of an image's last stage; of those that come several times, all in one line."""
+    """Instructions of an image's last stage. Repeated instructions are joined in one line."""
     text = (DOCKER / name).read_text().replace("\\\n", " ")
     found: dict[str, str] = {}
     for word, rest in re.findall(r"(?m)^([A-Z]+) +(.*)$", text[text.rindex("\nFROM ") :]):
@@ -166,10 +166,10 @@ def last_stage(name: str) -> dict[str, str]:
     return found
 
 
-def test_a_worker_by_compose_serves_the_demo_street_to_who_has_the_token(
+def test_a_compose_worker_serves_the_demo_street_with_its_token(
     compose, worker, tmp_path, worker_kernels
 ):
-    """The process that compose starts, in folders for its volumes and on a port of its own."""
+    """Runs the process that compose starts, with folders as volumes and a free port."""
     token = secrets.token_hex(16)
     folders = {place: tmp_path / source for place, source in mounts(worker).items()}
     for folder in folders.values():
@@ -200,12 +200,12 @@ def test_a_worker_by_compose_serves_the_demo_street_to_who_has_the_token(
         process.kill()
         process.join()
     assert picture.shape[1] == 120
-    assert picture.std() > 20  # A street, not one colour.
+    assert picture.std() > 20  # A street has several colours.
     assert (folders["/var/lib/real2sim"] / "real2sim.db").exists()
 
 
 def build_options() -> list[str]:
-    """Of ``buildah bud``, from ``BUILDAH_OPTIONS``; skips where no image can be built."""
+    """Options of ``buildah bud``, from ``BUILDAH_OPTIONS``. Skips if no image can be built."""
     missing = [name for name in ("buildah", "debootstrap") if shutil.which(name) is None]
     if missing:
         pytest.skip(f"there is no {' and no '.join(missing)} (make system-packages)")
@@ -225,8 +225,8 @@ def build_options() -> list[str]:
 
 @pytest.mark.slow
 @pytest.mark.timeout(5400)
-def test_the_image_for_cpus_is_built_and_is_ready_as_its_user_on_a_read_only_root():
-    """Some ten minutes of processor time, nearly all of it kernels."""
+def test_the_cpu_image_builds_and_is_ready_as_its_user_on_a_read_only_root():
+    """Takes some ten minutes of CPU time, nearly all of it to compile kernels."""
     command = ["nice", "-n", "10", str(DOCKER / "build.sh"), "cpu", "--", *build_options()]
     done = subprocess.run(command, check=False, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout[-4000:] + done.stderr[-4000:]

@@ -1,4 +1,4 @@
-"""The pages under docs, the changelog, and the site that is built from them."""
+"""The pages of docs, the changelog, and the generated site."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ INTERNALS = (
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: str(p.relative_to(REPOSITORY)))
-def test_links_of_a_page_lead_somewhere_in_the_repository(page: Path) -> None:
+def test_links_between_pages_are_valid(page: Path) -> None:
     targets = [t for t in LINK.findall(page.read_text("utf-8")) if ":" not in t]
     missing = [t for t in targets if not (page.parent / t).exists()]
     assert missing == []
@@ -53,7 +53,7 @@ def test_every_page_is_on_the_site(page: Path) -> None:
     assert shown_as in contents or name in {"README", "index"}
 
 
-def test_the_newest_release_in_the_changelog_is_the_version() -> None:
+def test_the_latest_changelog_entry_matches_the_version() -> None:
     texts = [(REPOSITORY / f / "pyproject.toml").read_text("utf-8") for f in ("client", ".")]
     sdk, server = (tomllib.loads(text)["project"] for text in texts)
     version = sdk["version"]
@@ -64,14 +64,14 @@ def test_the_newest_release_in_the_changelog_is_the_version() -> None:
     assert heads[0] == version
 
 
-def test_the_rest_page_has_every_error_code_with_its_status() -> None:
+def test_the_rest_page_lists_every_error_code_with_its_status() -> None:
     page = (REPOSITORY / "docs/rest.md").read_text("utf-8")
     rows = re.findall(r"^\| `([A-Z_]+)` \| (\d+) \| .+ \| (yes)? ?\|$", page, re.M)
     told = [(code, int(status), bool(again)) for code, status, again in rows]
     assert told == [(c.value, HTTP_STATUS[c], c in RETRYABLE) for c in ErrorCode]
 
 
-def test_the_site_is_built_without_a_warning_and_shows_no_internals(tmp_path: Path) -> None:
+def test_the_site_builds_without_warnings_and_shows_no_internals(tmp_path: Path) -> None:
     folders = ["-d", tmp_path / "doctrees", REPOSITORY / "docs", tmp_path / "site"]
     command = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", *folders]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -83,7 +83,7 @@ def test_the_site_is_built_without_a_warning_and_shows_no_internals(tmp_path: Pa
 
 
 def commands() -> Iterator[tuple[str, str]]:
-    """Every call of ``real2sim`` in the blocks of a page."""
+    """All calls of ``real2sim`` in the blocks of a page."""
     for path in WITH_BLOCKS:
         for _, text in BLOCK.findall(path.read_text("utf-8")):
             for line in text.replace("\\\n", " ").splitlines():
@@ -92,8 +92,8 @@ def commands() -> Iterator[tuple[str, str]]:
 
 
 @pytest.mark.parametrize(("where", "call"), list(commands()))
-def test_every_command_of_the_pages_is_one(where: str, call: str) -> None:
-    """Its name is known, and its options are."""
+def test_every_command_in_the_docs_is_valid(where: str, call: str) -> None:
+    """Command names and options exist."""
     context = click.Context(typer.main.get_command(build_app()), info_name="real2sim")
     arguments = [word for word in shlex.split(call, comments=True) if word != "&"]
     while isinstance(context.command, click.Group):

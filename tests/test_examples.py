@@ -1,4 +1,4 @@
-"""The scripts of ``examples`` run as they are, in an empty folder."""
+"""The scripts of ``examples``, run unchanged in an empty folder."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ EXAMPLES = {
     "dataset": ("boxes", "dataset"),
     "train_policy": ("round 5: ", None),
 }
-"""What each example prints, and a file or folder that it leaves."""
+"""Output of each example, and a file or folder that it creates."""
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""Releases: fragments of the changelog, and the script that turns them into a version."""
+"""Releases: changelog fragments, and the script that creates a version from them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ spec.loader.exec_module(release)
 
 @pytest.fixture
 def checkout(tmp_path: Path) -> Path:
-    """What a release changes, in a repository of its own, with one fragment."""
+    """A repository with the files that a release changes, and one fragment."""
     for name in FILES:
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(REPOSITORY / name, tmp_path / name)
@@ -35,7 +35,7 @@ def checkout(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_every_fragment_has_a_type_that_the_changelog_knows() -> None:
+def test_every_fragment_has_a_known_type() -> None:
     settings = tomllib.loads((REPOSITORY / "pyproject.toml").read_text("utf-8"))
     types = [kind["directory"] for kind in settings["tool"]["towncrier"]["type"]]
     for fragment in (REPOSITORY / "changelog.d").glob("*.md"):
@@ -60,7 +60,7 @@ def test_a_release_sets_both_versions_and_moves_the_fragments(checkout: Path) ->
 @pytest.mark.parametrize(
     ("version", "message"), [("0.0.1", "not newer"), ("next", "not a version")]
 )
-def test_a_version_that_cannot_follow_is_refused_before_anything_is_written(
+def test_an_invalid_version_is_refused_before_anything_is_written(
     checkout: Path, version: str, message: str
 ) -> None:
     with pytest.raises(ValueError, match=message):

@@ -1,6 +1,6 @@
-"""First days with Real2Sim, from its wheels, in an empty home: a policy, and a drive of one's own.
+"""First use of Real2Sim from its wheels, in an empty home: evaluate a policy, and import a drive.
 
-Who deploys a worker has a test in ``test_docker.py``.
+Deployment is tested in ``test_docker.py``.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Home:
         return kept | {"HOME": str(self.folder), "PATH": f"{self.bin}:{os.environ['PATH']}"}
 
     def run(self, command: str) -> str:
-        """What a shell command prints; it must succeed."""
+        """Output of a shell command, which must succeed."""
         done = subprocess.run(
             ["bash", "-eo", "pipefail", "-c", command], cwd=self.folder, env=self.environment,
             capture_output=True, text=True, timeout=INSTALL_S, check=False,
@@ -52,7 +52,7 @@ class Home:
 
 @pytest.fixture(scope="module")
 def bin_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Of an environment that has the wheels, and what pip brings for it."""
+    """The bin folder of an environment with the wheels and their dependencies from pip."""
     root = tmp_path_factory.mktemp("wheel")
     pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "-q"]
     sources = [REPOSITORY / "client", REPOSITORY]
@@ -73,7 +73,7 @@ def home(bin_folder: Path, tmp_path: Path) -> Home:
 
 @pytest.fixture
 def serve(home: Home) -> Iterator[Callable[[str], str]]:
-    """Starts a worker by a command, and gives its address."""
+    """Start a worker by a command. Returns its address."""
     started: list[subprocess.Popen[bytes]] = []
 
     def start(command: str) -> str:
@@ -103,7 +103,7 @@ def block(page: str, words: str) -> str:
     return found
 
 
-def test_a_policy_that_sees_is_compared_with_idm(home: Home, serve: Callable[[str], str]) -> None:
+def test_a_camera_policy_is_compared_with_idm(home: Home, serve: Callable[[str], str]) -> None:
     url = serve("serve --demo --port 0 --data data")
     (home.folder / "mine.py").write_text(block("README.md", "class Mine"))
     home.run(
@@ -123,7 +123,7 @@ def test_a_policy_that_sees_is_compared_with_idm(home: Home, serve: Callable[[st
     assert (home.folder / "out/report.html").exists()
 
 
-def test_a_log_made_of_arrays_is_checked_reconstructed_edited_and_driven(
+def test_a_log_from_arrays_is_checked_reconstructed_edited_and_driven(
     home: Home, serve: Callable[[str], str]
 ) -> None:
     arrays = block("docs/log_format.md", "# What was recorded")

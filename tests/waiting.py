@@ -1,4 +1,4 @@
-"""Waiting for what another thread or process does."""
+"""Wait for other threads or processes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TypeVar
 T = TypeVar("T")
 
 LIMIT_S = 120.0
-"""Far longer than anything takes, even on a busy machine [s]."""
+"""Much longer than any wait takes, even on a busy machine [s]."""
 
 POLL_S = 0.01
 
@@ -18,15 +18,15 @@ POLL_S = 0.01
 def wait_until(
     holds: Callable[[], T], what: str | Callable[[], str], *, seconds: float = LIMIT_S
 ) -> T:
-    """Wait until ``holds()`` is true, and return what it returned.
+    """Wait until ``holds()`` is true, and return its result.
 
     Args:
         holds: the condition, checked every 10 ms.
-        what: named in the error; a function is only called for that.
-        seconds: to wait [s]. Leave it out: a limit that can be reached makes a test flaky.
+        what: named in the error. A function is only called for the error.
+        seconds: time limit [s]. Leave it out: a limit that can be reached makes a test flaky.
 
     Raises:
-        AssertionError: the time is up.
+        AssertionError: the time limit has passed.
     """
     for _ in _polls(what, seconds):
         if result := holds():
@@ -38,7 +38,7 @@ def wait_until(
 async def wait_until_async(
     holds: Callable[[], T], what: str | Callable[[], str], *, seconds: float = LIMIT_S
 ) -> T:
-    """:func:`wait_until` on an event loop, which runs meanwhile."""
+    """:func:`wait_until` on an event loop, which keeps running."""
     for _ in _polls(what, seconds):
         if result := holds():
             return result

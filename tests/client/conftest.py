@@ -1,4 +1,4 @@
-"""A fake worker for the client's tests."""
+"""Fixtures with a fake worker for the client's tests."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The fake worker's world: a straight road, one vehicle, one camera."""
+"""The world of the fake worker: a straight road, one vehicle and one camera."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ CAMERA = {
 
 
 class Episode:
-    """A straight road along x; the vehicle is wherever its plan says."""
+    """A straight road along x. The vehicle follows its plans exactly."""
 
     def __init__(self) -> None:
         self.spec = ResetSpec()
@@ -90,7 +90,7 @@ class Episode:
 
 
 def frame(codec: str, *, t_us: int = 0) -> dict[str, Any]:
-    """The one picture there is, as a frame of the wire."""
+    """The only image, as a wire frame."""
     data = IMAGE.tobytes() if codec == "raw" else simplejpeg.encode_jpeg(IMAGE, quality=95)
     return {
         "sensor": "front",

@@ -1,6 +1,6 @@
-"""A worker without scenes: speaks the contract over a real socket, and misbehaves on request.
+"""A worker without scenes that speaks the protocol over a real socket, and misbehaves on request.
 
-The vehicle stands exactly where a plan says it should be; one camera shows a ramp of greys.
+The vehicle follows its plans exactly. One camera shows a grey ramp.
 """
 
 from __future__ import annotations
@@ -38,15 +38,15 @@ OBJECT = {
     "end_us": 10_000_000,
 }
 SHORT_S = 0.05
-"""A time that tests let run out: nothing that must come is waited for so shortly."""
+"""Timeout that tests let expire [s]. Never used for an answer that must arrive."""
 SCENE = {"scene": "street", "state": "resident", "cameras": [CAMERA], "objects": [OBJECT]}
 
 
 class FakeWorker:
-    """State of the worker. Set ``mischief`` to make it misbehave.
+    """State of the fake worker. Set ``mischief`` to make it misbehave.
 
     Attributes:
-        goes_on: set by a test: what is late is answered from now on.
+        goes_on: set by a test to let delayed answers through.
     """
 
     def __init__(self) -> None:
@@ -69,7 +69,7 @@ class FakeWorker:
         )
 
     def forget(self) -> None:
-        """Begin anew."""
+        """Reset the state."""
         self.mischief = ""
         self.goes_on = False
         self.requests: list[tuple[str, str, dict[str, str]]] = []
@@ -80,7 +80,7 @@ class FakeWorker:
 
     @contextmanager
     def running(self) -> Iterator[FakeWorker]:
-        """Serve on a free port of this machine, in a thread."""
+        """Serve on a free local port in a thread."""
         listener = socket.create_server(("127.0.0.1", 0))
         self.url = f"http://127.0.0.1:{listener.getsockname()[1]}"
         config = uvicorn.Config(
@@ -179,7 +179,7 @@ class FakeWorker:
         return JSONResponse(answer)
 
     def record(self, operations: list[dict[str, Any]]) -> None:
-        """Append to the history, as if somebody had edited."""
+        """Append to the history, as if another client had edited."""
         self.log.append(
             {
                 "revision": len(self.log) + 1,
@@ -274,7 +274,7 @@ class FakeWorker:
             answer = {"type": "edited", "revision": episode.revision, "created": ["car_3_copy1"]}
         elif isinstance(message, Render):
             if self.mischief == "late images":
-                await asyncio.sleep(5 * SHORT_S)  # Longer than most answers are waited for.
+                await asyncio.sleep(5 * SHORT_S)  # Longer than the reply timeout of the test.
             answer = {
                 "type": "view",
                 "t_us": episode.t_us,
@@ -314,14 +314,14 @@ class FakeWorker:
         }
 
     async def _misbehave(self, socket: WebSocket, action: Action) -> bool:
-        """Whether the message has been answered, or is not going to be."""
+        """Whether the message has been answered or will not be answered."""
         mischief, self.mischief = self.mischief, ""
         envelope = {"v": 1, "id": action.id}
         match mischief:
             case "hang":
                 return True
             case "late":
-                # Two answers then: this one when nobody waits for it any more.
+                # The client has timed out by now, so it gets two answers.
                 await wait_until_async(lambda: self.goes_on, "the test to go on")
                 return False
             case "restart":

@@ -1,4 +1,4 @@
-"""The command, as it is typed."""
+"""The command line of the client."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from .fake_worker import FakeWorker
 
 @dataclass
 class Done:
-    """What a command left behind."""
+    """Outcome of a command."""
 
     returncode: int
     stdout: str
@@ -37,7 +37,7 @@ Run = Callable[..., Done]
 
 @pytest.fixture
 def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
-    """Run the command in this process; starting a new one each time takes seconds."""
+    """Run the command in this process. Starting a new one each time takes seconds."""
 
     def run(*arguments: str, **environment: str) -> Done:
         for name, value in ({"NO_COLOR": "1", "COLUMNS": "120"} | environment).items():
@@ -60,13 +60,13 @@ def test_status_shows_the_worker(run: Run, worker: FakeWorker) -> None:
 
 
 @pytest.mark.network
-def test_figures_go_to_standard_output_as_json_alone(run: Run, worker: FakeWorker) -> None:
+def test_json_output_goes_to_standard_output(run: Run, worker: FakeWorker) -> None:
     done = run("scenes", "--json", "-", REAL2SIM_URL=worker.url)
     assert [scene["scene"] for scene in json.loads(done.stdout)] == ["street"]
 
 
 @pytest.mark.network
-def test_frame_saves_what_the_worker_renders(run: Run, worker: FakeWorker, tmp_path: Path) -> None:
+def test_frame_saves_the_rendered_image(run: Run, worker: FakeWorker, tmp_path: Path) -> None:
     target = tmp_path / "front.jpg"
     options = ("--scene", "street", "--camera", "front", "--out", str(target))
     assert run("frame", *options, "--url", worker.url).returncode == 0
@@ -91,7 +91,7 @@ def operations(tmp_path: Path) -> Path:
 
 
 @pytest.mark.network
-def test_a_new_scenario_is_not_kept_where_its_edit_is_refused(
+def test_a_new_scenario_is_deleted_if_its_edit_is_refused(
     run: Run, worker: FakeWorker, operations: Path
 ) -> None:
     worker.mischief = "refuses edits"
@@ -102,7 +102,7 @@ def test_a_new_scenario_is_not_kept_where_its_edit_is_refused(
 
 
 @pytest.mark.network
-def test_a_dry_run_keeps_no_new_scenario(run: Run, worker: FakeWorker, operations: Path) -> None:
+def test_a_dry_run_deletes_its_new_scenario(run: Run, worker: FakeWorker, operations: Path) -> None:
     options = ("--scene", "street", "--dry-run", "--url", worker.url)
     done = run("edit", str(operations), *options)
     assert done.returncode == 0, done.stderr
@@ -111,7 +111,7 @@ def test_a_dry_run_keeps_no_new_scenario(run: Run, worker: FakeWorker, operation
 
 
 @pytest.mark.network
-def test_an_old_scenario_stays_where_its_edit_is_refused(
+def test_an_existing_scenario_is_kept_if_its_edit_is_refused(
     run: Run, worker: FakeWorker, operations: Path
 ) -> None:
     worker.mischief = "refuses edits"
@@ -120,7 +120,7 @@ def test_an_old_scenario_stays_where_its_edit_is_refused(
 
 
 @pytest.mark.network
-def test_an_edit_that_applies_keeps_its_new_scenario(
+def test_a_new_scenario_is_kept_if_its_edit_applies(
     run: Run, worker: FakeWorker, operations: Path
 ) -> None:
     assert run("edit", str(operations), "--scene", "street", "--url", worker.url).returncode == 0
@@ -146,7 +146,7 @@ def test_drive_reports_rates_and_saves_frames(run: Run, worker: FakeWorker, tmp_
 
 
 @pytest.mark.network
-def test_drive_asks_for_what_its_flags_say(run: Run, worker: FakeWorker) -> None:
+def test_drive_flags_set_the_reset_options(run: Run, worker: FakeWorker) -> None:
     done = run(
         *("drive", "--scene", "street", "--steps", "1", "--url", worker.url),
         *("--beyond-log", "loop", "--spawn", '{"density": 30}', "--seed", "4"),
@@ -173,7 +173,7 @@ def test_drive_asks_for_what_its_flags_say(run: Run, worker: FakeWorker) -> None
     ],
 )
 @pytest.mark.network
-def test_flags_that_are_wrong_are_named(
+def test_invalid_flags_are_named_in_the_error(
     run: Run, worker: FakeWorker, flags: tuple[str, str], sentence: str
 ) -> None:
     done = run("drive", "--scene", "street", "--url", worker.url, *flags)
@@ -183,7 +183,7 @@ def test_flags_that_are_wrong_are_named(
 
 
 @pytest.mark.network
-def test_a_refusal_on_the_way_is_a_sentence_and_not_a_traceback(
+def test_a_refused_handshake_prints_an_error_without_a_traceback(
     run: Run, worker: FakeWorker
 ) -> None:
     worker.mischief = "426 at the handshake"
@@ -194,14 +194,14 @@ def test_a_refusal_on_the_way_is_a_sentence_and_not_a_traceback(
     assert "Traceback" not in done.stderr
 
 
-def test_without_a_worker_it_says_how_to_start_one(run):
+def test_without_a_worker_the_error_says_how_to_start_one(run):
     done = run("status", "--url", "http://127.0.0.1:9")
     assert done.returncode == 1
     assert done.stderr.startswith("error: no worker answers at http://127.0.0.1:9")
     assert "hint: start a worker with `real2sim serve`" in done.stderr
 
 
-def test_tracebacks_are_there_for_those_who_ask(monkeypatch):
+def test_real2sim_debug_shows_tracebacks(monkeypatch):
     monkeypatch.setenv("REAL2SIM_DEBUG", "1")
     monkeypatch.setattr("sys.argv", ["real2sim", "status", "--url", "nonsense"])
     with pytest.raises(ValueError, match="is not an address"):
@@ -221,7 +221,7 @@ def test_the_installed_command_starts():
         ("frame --camera front -o a.jpg", "--scene and --scenario"),
     ],
 )
-def test_a_scene_or_a_scenario_is_needed(run, command, named):
+def test_a_scene_or_a_scenario_is_required(run, command, named):
     done = run(*command.split())
     assert done.returncode == 2
     assert f"exactly one of {named}" in done.stderr
@@ -230,7 +230,7 @@ def test_a_scene_or_a_scenario_is_needed(run, command, named):
 @pytest.mark.parametrize(
     ("content", "sentence"), [("{", "is not JSON"), ("{}", "give a list of operations")]
 )
-def test_an_operations_file_of_another_kind_is_named(run, tmp_path, content, sentence):
+def test_an_invalid_operations_file_is_explained(run, tmp_path, content, sentence):
     file = tmp_path / "edit.json"
     file.write_text(content)
     done = run("edit", str(file), "--scene", "street")
@@ -238,7 +238,7 @@ def test_an_operations_file_of_another_kind_is_named(run, tmp_path, content, sen
     assert sentence in done.stderr
 
 
-def test_commands_of_other_packages_stand_beside_the_own(monkeypatch):
+def test_commands_of_other_packages_are_added(monkeypatch):
     entry = EntryPoint("x", f"{__name__}:extension", cli.COMMAND_GROUP)
     monkeypatch.setattr(EntryPoint, "load", lambda self: extension)
     monkeypatch.setattr(cli, "entry_points", lambda group: [entry])
@@ -246,7 +246,7 @@ def test_commands_of_other_packages_stand_beside_the_own(monkeypatch):
     assert {"status", "drive", "fly"} <= set(names)
 
 
-def test_a_broken_package_takes_no_command_away(monkeypatch, capsys):
+def test_a_broken_package_is_reported_and_other_commands_remain(monkeypatch, capsys):
     entry = EntryPoint("x", "no_such_package:app", cli.COMMAND_GROUP)
     monkeypatch.setattr(cli, "entry_points", lambda group: [entry])
     names = typer.main.get_command(cli.build_app()).list_commands(None)
@@ -262,7 +262,7 @@ def test_a_broken_package_takes_no_command_away(monkeypatch, capsys):
         (RuntimeError("odd"), "error: RuntimeError: odd\nhint: REAL2SIM_DEBUG=1"),
     ],
 )
-def test_errors_are_said_in_one_sentence(error, sentence, capsys):
+def test_errors_are_printed_as_one_sentence(error, sentence, capsys):
     cli.print_error(error)
     assert capsys.readouterr().err.startswith(sentence)
 
@@ -280,7 +280,7 @@ def swim() -> None:
     """Not a car either."""
 
 
-def test_the_width_holds_for_what_a_planner_is_shown():
+def test_the_width_also_applies_to_cameras_of_the_planner():
     needed = [
         {"camera": "front", "modalities": ["rgb"], "width": None},
         {"camera": "left", "modalities": ["depth"], "width": 64},

@@ -1,4 +1,4 @@
-"""Requests and answers without a network: what goes out, and what each answer becomes."""
+"""Requests and responses without a network."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SCENES = {"scenes": [{"scene": "street", "state": "resident"}]}
 
 
 class Script:
-    """Answers in order; the last one for ever."""
+    """Answers in order, then repeats the last answer."""
 
     def __init__(self, *answers: httpx2.Response | Exception) -> None:
         self.answers = list(answers)
@@ -79,7 +79,7 @@ def slept(monkeypatch: pytest.MonkeyPatch) -> list[float]:
         (418, "CODE_OF_THE_FUTURE", real2sim.StatusError),
     ],
 )
-def test_a_problem_becomes_the_error_of_its_code(status, code, error):
+def test_a_problem_raises_the_error_of_its_code(status, code, error):
     with (
         client_of(Script(problem(status, code)), retries=0) as client,
         pytest.raises(error, match=f"about {code}") as caught,
@@ -88,7 +88,7 @@ def test_a_problem_becomes_the_error_of_its_code(status, code, error):
     assert type(caught.value) is error
 
 
-def test_an_error_carries_everything_the_problem_says():
+def test_an_error_contains_all_fields_of_the_problem():
     said = problem(
         422,
         "INVALID_REQUEST",
@@ -104,7 +104,7 @@ def test_an_error_carries_everything_the_problem_says():
     assert "/width: at most 8192" in str(error)
 
 
-def test_what_the_detail_says_is_not_said_twice():
+def test_an_error_message_is_not_repeated():
     said = problem(
         422, "INVALID_REQUEST", errors=[{"pointer": "/x", "message": "about INVALID_REQUEST"}]
     )
@@ -113,7 +113,7 @@ def test_what_the_detail_says_is_not_said_twice():
     assert str(caught.value) == "about INVALID_REQUEST [INVALID_REQUEST]"
 
 
-def test_a_proxy_that_answers_with_html_is_still_one_sentence():
+def test_an_html_error_of_a_proxy_becomes_one_sentence():
     page = httpx2.Response(502, text="<html>bad gateway</html>")
     with (
         client_of(Script(page), retries=0) as client,
@@ -123,7 +123,7 @@ def test_a_proxy_that_answers_with_html_is_still_one_sentence():
 
 
 @pytest.mark.parametrize("content", [b"", b"hello", b"[]", b'{"scenes": 3}', b'{"scenes": [{}]}'])
-def test_an_answer_of_another_shape_is_malformed(content):
+def test_a_reply_of_another_shape_is_malformed(content):
     with (
         client_of(Script(httpx2.Response(200, content=content))) as client,
         pytest.raises(real2sim.MalformedReplyError, match="not a SceneList"),
@@ -140,7 +140,7 @@ def test_members_of_a_newer_worker_are_ignored():
 # --- retries ----------------------------------------------------------------------------------
 
 
-def test_a_busy_worker_is_asked_again_after_the_time_it_names(slept):
+def test_a_busy_worker_is_retried_after_retry_after(slept):
     busy = problem(503, "QUEUE_FULL")
     busy.headers["Retry-After"] = "3"
     script = Script(busy, httpx2.Response(200, json=SCENES))
@@ -149,7 +149,7 @@ def test_a_busy_worker_is_asked_again_after_the_time_it_names(slept):
     assert slept == [3.0]
 
 
-def test_a_full_disk_is_waited_for_and_a_full_device_is_not(slept):
+def test_a_full_disk_is_retried_but_a_full_device_is_not(slept):
     script = Script(problem(507, "STORAGE_FULL"), httpx2.Response(200, json=SCENES))
     with client_of(script) as client:
         assert len(client.scenes.list()) == 1
@@ -159,7 +159,7 @@ def test_a_full_disk_is_waited_for_and_a_full_device_is_not(slept):
     assert len(slept) == 1
 
 
-def test_a_worker_that_stays_busy_is_given_up_with_its_wish(slept):
+def test_a_worker_that_stays_busy_raises_with_retry_after(slept):
     busy = problem(429, "OVER_CAPACITY")
     busy.headers["Retry-After"] = "5"
     script = Script(busy)
@@ -168,7 +168,7 @@ def test_a_worker_that_stays_busy_is_given_up_with_its_wish(slept):
     assert (len(script.requests), slept, caught.value.retry_after) == (3, [5.0, 5.0], 5.0)
 
 
-def test_all_tries_of_one_call_have_one_idempotency_key_and_calls_have_their_own(slept):
+def test_retries_share_an_idempotency_key_and_calls_do_not(slept):
     script = Script(problem(503, "DRAINING"))
     with client_of(script, retries=2) as client:
         for _ in range(2):
@@ -180,27 +180,27 @@ def test_all_tries_of_one_call_have_one_idempotency_key_and_calls_have_their_own
     assert keys[0] != keys[3]
 
 
-def test_a_broken_connection_is_tried_again(slept):
+def test_a_broken_connection_is_retried(slept):
     script = Script(httpx2.ReadError("reset by peer"), httpx2.Response(200, json=SCENES))
     with client_of(script) as client:
         assert len(client.scenes.list()) == 1
 
 
-def test_steps_are_never_sent_twice(slept):
+def test_a_step_is_not_retried_after_a_broken_connection(slept):
     script = Script(httpx2.ReadError("reset by peer"))
     with client_of(script) as client, pytest.raises(real2sim.UnreachableError):
         client.sessions.step("w0.abc", n=3)
     assert len(script.requests) == 1
 
 
-def test_what_will_not_get_better_is_not_tried_again(slept):
+def test_permanent_errors_are_not_retried(slept):
     script = Script(problem(404, "UNKNOWN_SCENE"))
     with client_of(script) as client, pytest.raises(real2sim.NotFoundError):
         client.scenes.get("nowhere")
     assert (len(script.requests), slept) == (1, [])
 
 
-def test_a_timeout_names_the_call_and_the_seconds(slept):
+def test_a_timeout_error_names_the_call_and_the_limit(slept):
     script = Script(httpx2.ReadTimeout("slow"))
     with (
         client_of(script, timeout=4.0, retries=0) as client,
@@ -209,14 +209,14 @@ def test_a_timeout_names_the_call_and_the_seconds(slept):
         client.scenes.list()
 
 
-def test_a_slow_render_is_not_asked_for_again(slept):
+def test_a_slow_render_is_not_retried(slept):
     script = Script(httpx2.ReadTimeout("slow"))
     with client_of(script) as client, pytest.raises(real2sim.ReplyTimeoutError, match="300 s"):
         client.scenes.render("street", camera="front")
     assert len(script.requests) == 1
 
 
-def test_the_async_client_retries_alike(monkeypatch):
+def test_the_async_client_retries_in_the_same_way(monkeypatch):
     delays: list[float] = []
 
     async def no_sleep(seconds: float) -> None:
@@ -236,10 +236,10 @@ def test_the_async_client_retries_alike(monkeypatch):
     assert delays == [2.0]
 
 
-# --- what goes out ----------------------------------------------------------------------------
+# --- requests ---------------------------------------------------------------------------------
 
 
-def test_the_token_is_sent_and_never_shown():
+def test_the_token_is_sent_but_not_shown():
     script = Script(httpx2.Response(200, json=SCENES))
     with client_of(script, token="secret") as client:
         client.scenes.list()
@@ -248,7 +248,7 @@ def test_the_token_is_sent_and_never_shown():
         assert "***" in repr(client)
 
 
-def test_names_cannot_leave_their_place_in_the_path():
+def test_names_are_escaped_in_paths():
     script = Script(problem(404, "UNKNOWN_SCENE"))
     with client_of(script) as client, pytest.raises(real2sim.NotFoundError):
         client.scenes.get("../server?x=1")
@@ -264,7 +264,7 @@ def test_names_cannot_leave_their_place_in_the_path():
         ("http://127.0.0.1:8600", "png", "image/png"),
     ],
 )
-def test_pictures_come_raw_on_this_machine_and_as_jpeg_over_a_network(url, codec, accept):
+def test_images_are_raw_on_loopback_and_jpeg_over_a_network(url, codec, accept):
     script = Script(problem(404, "UNKNOWN_CAMERA"))
     transport = httpx2.MockTransport(script)
     with (
@@ -275,7 +275,7 @@ def test_pictures_come_raw_on_this_machine_and_as_jpeg_over_a_network(url, codec
     assert script.requests[0].headers["accept"] == accept
 
 
-def test_depth_is_asked_for_without_loss_everywhere():
+def test_depth_is_always_requested_losslessly():
     script = Script(problem(404, "UNKNOWN_CAMERA"))
     with client_of(script) as client, pytest.raises(real2sim.NotFoundError):
         client.scenes.render("street", camera="front", modality="depth", t_us=5, width=320)
@@ -289,7 +289,7 @@ def test_depth_is_asked_for_without_loss_everywhere():
     }
 
 
-def test_a_raw_picture_has_its_pose_and_intrinsics():
+def test_a_raw_image_has_its_pose():
     content = encode(frame("raw"))
     headers = {"content-type": "application/msgpack"}
     answer = httpx2.Response(200, content=content, headers=headers)
@@ -300,7 +300,7 @@ def test_a_raw_picture_has_its_pose_and_intrinsics():
     np.testing.assert_array_equal(picture.T_world_sensor, np.eye(4))
 
 
-def test_all_tries_of_an_upload_send_the_same_bytes(tmp_path, slept):
+def test_all_attempts_of_an_upload_send_the_same_bytes(tmp_path, slept):
     file = tmp_path / "street.ply"
     file.write_bytes(b"ply\n...")
     script = Script(problem(503, "QUEUE_FULL"))
@@ -313,7 +313,7 @@ def test_all_tries_of_an_upload_send_the_same_bytes(tmp_path, slept):
 
 
 @pytest.mark.parametrize("names", [{}, {"scene": "a", "scenario": "b"}])
-def test_a_session_runs_on_exactly_one_world(names):
+def test_a_session_requires_exactly_one_world(names):
     script = Script(problem(500, "INTERNAL"))
     with client_of(script) as client, pytest.raises(ValueError, match="name exactly one"):
         client.session(**names).open()
@@ -333,7 +333,7 @@ SCENARIO = {
 }
 
 
-def test_a_session_takes_a_scenario_or_its_id():
+def test_a_session_accepts_a_scenario_or_its_id():
     script = Script(httpx2.Response(200, json=SCENARIO), problem(404, "UNKNOWN_SCENARIO"))
     with client_of(script) as client:
         scenario = client.scenarios.get("sc_1")
@@ -344,7 +344,7 @@ def test_a_session_takes_a_scenario_or_its_id():
     assert sent == [{"scenario": "sc_1"}] * 3
 
 
-def test_a_session_takes_a_scene_or_its_name():
+def test_a_session_accepts_a_scene_or_its_name():
     script = Script(httpx2.Response(200, json=SCENES), problem(404, "UNKNOWN_SCENE"))
     with client_of(script) as client:
         (street,) = client.scenes.list()
@@ -361,7 +361,7 @@ def test_a_session_takes_a_scene_or_its_name():
         ({"scene": 3}, "scene is a int; give a name or a SceneInfo"),
     ],
 )
-def test_what_is_neither_a_scene_nor_a_scenario_is_refused_at_once(names, sentence):
+def test_an_invalid_scene_or_scenario_is_refused_immediately(names, sentence):
     with (
         client_of(Script(problem(500, "INTERNAL"))) as client,
         pytest.raises(TypeError, match=sentence),
@@ -378,12 +378,12 @@ def test_what_is_neither_a_scene_nor_a_scenario_is_refused_at_once(names, senten
         ("http://user:pw@worker", "holds credentials"),
     ],
 )
-def test_addresses_that_cannot_be_a_worker_are_refused_at_once(url, sentence):
+def test_an_invalid_url_is_refused_immediately(url, sentence):
     with pytest.raises(ValueError, match=sentence):
         real2sim.connect(url)
 
 
-def test_a_worker_of_another_protocol_version_is_named_with_both_versions():
+def test_a_protocol_mismatch_names_both_versions():
     info = {
         "version": "9.0",
         "protocol_version": 9,
@@ -411,7 +411,7 @@ def real2sim_limits() -> list[str]:
 # --- waiting ----------------------------------------------------------------------------------
 
 
-def test_waiting_for_a_worker_ends_with_what_was_in_the_way(slept):
+def test_a_wait_ready_timeout_includes_the_reasons(slept):
     answer = httpx2.Response(503, json={"ready": False, "reasons": ["compiling kernels"]})
     with (
         client_of(Script(answer)) as client,
@@ -421,7 +421,7 @@ def test_waiting_for_a_worker_ends_with_what_was_in_the_way(slept):
     assert caught.value.hint == "compiling kernels"
 
 
-def test_a_proxy_that_has_no_worker_yet_is_waited_for(slept):
+def test_a_503_of_a_proxy_counts_as_not_ready(slept):
     proxy = httpx2.Response(503, html="<h1>503 Service Unavailable</h1>")
     with (
         client_of(Script(*[proxy] * 5)) as client,
@@ -431,7 +431,7 @@ def test_a_proxy_that_has_no_worker_yet_is_waited_for(slept):
     assert "503" in caught.value.hint
 
 
-def test_loading_waits_until_the_scene_is_there(slept):
+def test_loading_waits_until_the_scene_is_resident(slept):
     loading = httpx2.Response(200, json={"scene": "street", "state": "loading"})
     resident = httpx2.Response(200, json={"scene": "street", "state": "resident"})
     script = Script(httpx2.Response(202, json={}), loading, loading, resident)
@@ -440,14 +440,14 @@ def test_loading_waits_until_the_scene_is_there(slept):
     assert [r.method for r in script.requests] == ["PUT", "GET", "GET", "GET"]
 
 
-def test_a_broken_scene_is_not_waited_for(slept):
+def test_loading_a_broken_scene_raises_immediately(slept):
     broken = {"scene": "street", "state": "broken", "reason": "truncated"}
     script = Script(httpx2.Response(202, json={}), httpx2.Response(200, json=broken))
     with client_of(script) as client, pytest.raises(real2sim.Real2SimError, match="truncated"):
         client.scenes.load("street")
 
 
-def test_a_collection_is_iterated_by_one_request_and_names_its_worker():
+def test_a_collection_is_iterated_with_one_request_and_shows_its_worker():
     script = Script(httpx2.Response(200, json=SCENES))
     with client_of(script) as client:
         assert [info.scene for info in client.scenes] == ["street"]
@@ -455,7 +455,7 @@ def test_a_collection_is_iterated_by_one_request_and_names_its_worker():
     assert len(script.requests) == 1
 
 
-def test_a_collection_is_iterated_asynchronously_too():
+def test_a_collection_supports_async_iteration():
     async def names() -> list[str]:
         transport = httpx2.MockTransport(lambda _: httpx2.Response(200, json=SCENES))
         async with real2sim.connect_async("http://worker:8600", transport=transport) as client:

@@ -1,4 +1,4 @@
-"""Where a client finds its worker, and what is said where there is none."""
+"""How a client finds its worker, and errors if there is none."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SCENES = {"scenes": [{"scene": "street", "state": "resident"}]}
 
 
 def request_of(**options: object) -> httpx2.Request:
-    """The request that a client sends which was made with these options."""
+    """The request sent by a client with these options."""
     requests = []
 
     def answer(request: httpx2.Request) -> httpx2.Response:
@@ -33,13 +33,13 @@ def no_worker_in_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("REAL2SIM_TOKEN", raising=False)
 
 
-def test_the_default_is_this_machine_without_a_token() -> None:
+def test_the_default_is_loopback_without_a_token() -> None:
     request = request_of()
     assert str(request.url).startswith("http://127.0.0.1:8600/")
     assert "authorization" not in request.headers
 
 
-def test_the_environment_goes_before_the_default(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_environment_overrides_the_default(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("REAL2SIM_URL", "http://worker:9000")
     monkeypatch.setenv("REAL2SIM_TOKEN", "from-the-environment")
     request = request_of()
@@ -47,7 +47,7 @@ def test_the_environment_goes_before_the_default(monkeypatch: pytest.MonkeyPatch
     assert request.headers["authorization"] == "Bearer from-the-environment"
 
 
-def test_arguments_go_before_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_arguments_override_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("REAL2SIM_URL", "http://worker:9000")
     monkeypatch.setenv("REAL2SIM_TOKEN", "from-the-environment")
     request = request_of(url="http://other:1", token="given")
@@ -55,7 +55,7 @@ def test_arguments_go_before_the_environment(monkeypatch: pytest.MonkeyPatch) ->
     assert request.headers["authorization"] == "Bearer given"
 
 
-def test_an_empty_token_sends_none(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_empty_token_disables_the_token(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("REAL2SIM_TOKEN", "from-the-environment")
     assert "authorization" not in request_of(token="").headers
 
@@ -68,7 +68,7 @@ def test_empty_variables_count_as_unset(monkeypatch: pytest.MonkeyPatch) -> None
     assert "authorization" not in request.headers
 
 
-def test_a_wrong_address_in_the_environment_is_said_to_come_from_there(
+def test_an_invalid_url_from_the_environment_names_the_variable(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv("REAL2SIM_URL", "worker:9000")
@@ -76,12 +76,12 @@ def test_a_wrong_address_in_the_environment_is_said_to_come_from_there(
         real2sim.connect()
 
 
-def test_the_async_client_asks_the_environment_too(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_async_client_reads_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("REAL2SIM_URL", "http://worker:9000")
     assert repr(real2sim.connect_async()) == "AsyncClient('http://worker:9000', token=None)"
 
 
-def test_a_script_without_a_worker_ends_in_one_short_error() -> None:
+def test_a_script_without_a_worker_ends_with_one_short_error() -> None:
     script = "import real2sim\nreal2sim.connect('http://127.0.0.1:9', retries=0).scenes.list()\n"
     done = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, check=False
@@ -95,7 +95,7 @@ def test_a_script_without_a_worker_ends_in_one_short_error() -> None:
     assert hint == "hint: start a worker with `real2sim serve`, or check the address"
 
 
-def test_the_async_client_hides_the_library_below_it_too() -> None:
+def test_the_async_client_hides_the_underlying_library_error() -> None:
     async def ask() -> None:
         async with real2sim.connect_async("http://127.0.0.1:9", retries=0) as client:
             await client.scenes.list()

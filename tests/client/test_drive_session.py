@@ -1,4 +1,4 @@
-"""The drive session against a worker on loopback, well behaved and not."""
+"""The drive session against a local worker that behaves well or misbehaves."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def connect(worker: FakeWorker) -> real2sim.Client:
 
 
 def wait_at_most(session: real2sim.DriveSession | real2sim.AsyncDriveSession, s: float) -> None:
-    """From now on: what opens a session may take as long as it takes on a busy machine."""
+    """Set the reply timeout from now on. Opening a session may take longer on a busy machine."""
     session._target = replace(session._target, timeout=s)
 
 
@@ -36,7 +36,7 @@ def test_lock_step_answers_each_plan_with_the_next_observation(worker: FakeWorke
     assert [m["step"] for m in worker.messages if m["type"] == "action"] == [0, 1, 2]
 
 
-def test_hello_carries_the_session_token_and_not_the_address_it_was_given(
+def test_hello_contains_the_session_token(
     worker: FakeWorker,
 ) -> None:
     with connect(worker) as client, client.session(scene="street"):
@@ -58,7 +58,7 @@ def test_jpeg_frames_are_decoded_as_rgb(worker: FakeWorker) -> None:
     assert np.abs(image.astype(int) - IMAGE).max() <= 6
 
 
-def test_edits_are_sent_on_the_revision_seen_last(worker: FakeWorker) -> None:
+def test_edits_are_sent_with_the_last_known_revision(worker: FakeWorker) -> None:
     with connect(worker) as client, client.session(scene="street") as session:
         session.reset()
         first = session.edit([{"op": "duplicate", "object_id": "car_3", "y": 3.0}])
@@ -67,7 +67,7 @@ def test_edits_are_sent_on_the_revision_seen_last(worker: FakeWorker) -> None:
     assert [m["base_rev"] for m in worker.messages if m["type"] == "edit"] == [0, 1]
 
 
-def test_render_shows_the_instant_and_leaves_the_clock_alone(worker: FakeWorker) -> None:
+def test_render_does_not_advance_the_clock(worker: FakeWorker) -> None:
     with connect(worker) as client, client.session(scene="street") as session:
         session.reset()
         view = session.render(["front"])
@@ -75,7 +75,7 @@ def test_render_shows_the_instant_and_leaves_the_clock_alone(worker: FakeWorker)
     np.testing.assert_array_equal(view.image("front"), IMAGE)
 
 
-def test_closing_ends_the_session_and_keeps_its_result(worker: FakeWorker) -> None:
+def test_closing_ends_the_session_and_stores_its_result(worker: FakeWorker) -> None:
     with connect(worker) as client, client.session(scene="street") as session:
         session.reset()
     assert session.result is not None
@@ -83,14 +83,14 @@ def test_closing_ends_the_session_and_keeps_its_result(worker: FakeWorker) -> No
     assert worker.messages[-1]["type"] == "bye"
 
 
-def test_leaving_a_joined_session_lets_it_live(worker: FakeWorker) -> None:
+def test_leaving_a_joined_session_does_not_end_it(worker: FakeWorker) -> None:
     with connect(worker) as client, client.join("w0.abc", token="t") as session:
         session.reset()
     assert "bye" not in [m["type"] for m in worker.messages]
     assert worker.deleted == []
 
 
-def test_a_plan_before_reset_is_refused_here(worker: FakeWorker) -> None:
+def test_a_step_before_reset_is_refused_by_the_client(worker: FakeWorker) -> None:
     with (
         connect(worker) as client,
         client.session(scene="street") as session,
@@ -99,7 +99,7 @@ def test_a_plan_before_reset_is_refused_here(worker: FakeWorker) -> None:
         session.step(STRAIGHT)
 
 
-def test_a_session_outside_its_with_block_says_how_to_use_it(worker: FakeWorker) -> None:
+def test_a_session_outside_its_with_block_raises_not_open(worker: FakeWorker) -> None:
     with connect(worker) as client:
         with client.session(scene="street") as session:
             pass
@@ -108,7 +108,7 @@ def test_a_session_outside_its_with_block_says_how_to_use_it(worker: FakeWorker)
 
 
 @pytest.mark.parametrize("mischief", ["426 at the handshake", "error after hello"])
-def test_a_worker_of_another_protocol_is_refused_with_both_versions(
+def test_a_protocol_mismatch_is_refused_with_both_versions(
     worker: FakeWorker, mischief: str
 ) -> None:
     worker.mischief = mischief
@@ -122,13 +122,13 @@ def test_a_worker_of_another_protocol_is_refused_with_both_versions(
     assert worker.deleted == ["w0.abc"]
 
 
-def test_a_worker_that_chooses_no_protocol_is_refused(worker: FakeWorker) -> None:
+def test_a_worker_that_selects_no_subprotocol_is_refused(worker: FakeWorker) -> None:
     worker.mischief = "no subprotocol"
     with connect(worker) as client, pytest.raises(real2sim.ProtocolMismatchError):
         client.session(scene="street").open()
 
 
-def test_a_silent_worker_is_not_waited_for_longer_than_the_timeout(worker: FakeWorker) -> None:
+def test_a_silent_worker_raises_after_the_timeout(worker: FakeWorker) -> None:
     with connect(worker) as client, client.session(scene="street") as session:
         session.reset()
         worker.mischief = "hang"
@@ -137,7 +137,7 @@ def test_a_silent_worker_is_not_waited_for_longer_than_the_timeout(worker: FakeW
             session.step(STRAIGHT)
 
 
-def test_after_a_timeout_the_same_plan_moves_the_worker_only_once(worker: FakeWorker) -> None:
+def test_retrying_a_step_after_a_timeout_advances_the_worker_once(worker: FakeWorker) -> None:
     with connect(worker) as client, client.session(scene="street") as session:
         session.reset()
         worker.mischief = "late"
@@ -150,7 +150,7 @@ def test_after_a_timeout_the_same_plan_moves_the_worker_only_once(worker: FakeWo
         assert session.step(STRAIGHT).step == 2
 
 
-def test_images_that_need_kernels_of_their_own_may_take_longer(worker: FakeWorker) -> None:
+def test_renders_have_a_longer_timeout(worker: FakeWorker) -> None:
     with connect(worker) as client, client.session(scene="street") as session:
         session.reset()
         worker.mischief = "late images"
@@ -158,7 +158,7 @@ def test_images_that_need_kernels_of_their_own_may_take_longer(worker: FakeWorke
         assert session.render(sensors=["front"]).t_us == 0
 
 
-def test_a_worker_that_leaves_is_reported_with_its_reason(worker: FakeWorker) -> None:
+def test_a_restarting_worker_is_reported_with_its_reason(worker: FakeWorker) -> None:
     with connect(worker) as client, client.session(scene="street", reconnect=0) as session:
         session.reset()
         worker.mischief = "restart"
@@ -177,9 +177,7 @@ def test_a_worker_that_leaves_is_reported_with_its_reason(worker: FakeWorker) ->
         ("missing fields", "t_us: Field required"),
     ],
 )
-def test_nonsense_from_the_worker_is_named(
-    worker: FakeWorker, mischief: str, sentence: str
-) -> None:
+def test_malformed_replies_are_explained(worker: FakeWorker, mischief: str, sentence: str) -> None:
     with connect(worker) as client, client.session(scene="street") as session:
         session.reset()
         worker.mischief = mischief
@@ -195,7 +193,7 @@ def test_messages_of_another_version_are_a_protocol_mismatch(worker: FakeWorker)
             session.step(STRAIGHT)
 
 
-def test_progress_is_waited_through(worker: FakeWorker) -> None:
+def test_progress_messages_are_skipped(worker: FakeWorker) -> None:
     with connect(worker) as client, client.session(scene="street") as session:
         session.reset()
         worker.mischief = "progress"
@@ -215,7 +213,7 @@ def test_progress_is_waited_through(worker: FakeWorker) -> None:
         ("CODE_OF_THE_FUTURE", real2sim.StatusError),
     ],
 )
-def test_refusals_on_the_socket_are_told_apart_and_leave_it_open(
+def test_refusals_raise_typed_errors_and_keep_the_socket_open(
     worker: FakeWorker, code: str, error: type[real2sim.StatusError]
 ) -> None:
     with connect(worker) as client, client.session(scene="street", reconnect=0) as session:
@@ -227,7 +225,7 @@ def test_refusals_on_the_socket_are_told_apart_and_leave_it_open(
     assert (caught.value.code, caught.value.step) == (code, 7)
 
 
-def test_what_the_worker_refuses_for_now_is_sent_again_after_the_time_it_asks_for(
+def test_a_retryable_refusal_is_resent_after_the_requested_time(
     worker: FakeWorker, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     waited: list[float] = []
@@ -267,7 +265,7 @@ def test_the_async_session_drives_the_same_episode(worker: FakeWorker) -> None:
     assert asyncio.run(drive()) == [o.ego.position[0] for o in sync]
 
 
-def test_the_async_session_does_not_wait_for_ever(worker: FakeWorker) -> None:
+def test_the_async_session_times_out(worker: FakeWorker) -> None:
     async def drive() -> None:
         async with (
             real2sim.connect_async(worker.url, timeout=LIMIT_S) as client,
@@ -282,7 +280,7 @@ def test_the_async_session_does_not_wait_for_ever(worker: FakeWorker) -> None:
     asyncio.run(drive())
 
 
-def test_no_worker_is_a_sentence_that_names_the_address() -> None:
+def test_an_unreachable_worker_is_named_by_address() -> None:
     with (
         real2sim.connect("http://127.0.0.1:9", retries=0) as client,
         pytest.raises(ConnectionError, match=r"no worker answers at http://127\.0\.0\.1:9"),

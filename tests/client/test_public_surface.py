@@ -73,21 +73,21 @@ PUBLIC = [
 HEAVY = ("torch", "numba", "cv2", "fastapi", "matplotlib", "scipy", "real2sim_server.render")
 
 
-def test_the_public_names_are_these_and_sorted():
+def test_the_public_names_are_the_expected_ones_and_sorted():
     assert real2sim.__all__ == sorted(PUBLIC) == dir(real2sim)
 
 
-def test_every_public_name_is_there():
+def test_every_public_name_exists():
     for name in real2sim.__all__:
         assert getattr(real2sim, name) is not None
 
 
-def test_other_names_are_not():
+def test_unknown_names_raise_attribute_error():
     with pytest.raises(AttributeError, match="no attribute 'Cleint'"):
         _ = real2sim.Cleint
 
 
-def test_every_error_is_public_and_drawn_in_the_tree():
+def test_every_error_is_public_and_in_the_documented_tree():
     classes = {
         name
         for name, value in vars(errors).items()
@@ -98,7 +98,7 @@ def test_every_error_is_public_and_drawn_in_the_tree():
         assert f"{name} " in errors.__doc__, name
 
 
-def test_the_tree_that_is_drawn_is_the_tree_that_is():
+def test_the_documented_error_tree_matches_the_classes():
     lines = [line for line in errors.__doc__.splitlines() if "Error " in f"{line} "]
     path: list[str] = []
     for line in lines:
@@ -119,17 +119,17 @@ def imported_after(code: str) -> set[str]:
     return set(done.stdout.split())
 
 
-def test_importing_the_sdk_imports_almost_nothing():
+def test_importing_the_sdk_loads_no_dependencies():
     loaded = imported_after("import real2sim")
     assert not loaded & {"numpy", "pydantic", "httpx2", "websockets", *HEAVY}
 
 
-def test_using_the_sdk_needs_none_of_the_workers_libraries():
+def test_using_the_sdk_loads_no_libraries_of_the_worker():
     code = "import real2sim, real2sim.planners\nreal2sim.connect().close()"
     assert not imported_after(code) & {*HEAVY, "real2sim_server"}
 
 
-def test_the_command_line_loads_nothing_heavy_before_a_command_runs():
+def test_building_the_command_line_loads_no_dependencies():
     loaded = imported_after("import real2sim.cli\nreal2sim.cli.build_app()")
     assert not loaded & {"numpy", "pydantic", "httpx2", "websockets", *HEAVY}
 
@@ -149,7 +149,7 @@ ALLOWED = {
 
 
 @pytest.mark.parametrize("path", sorted(PACKAGE.rglob("*.py")), ids=lambda p: p.stem)
-def test_the_client_imports_only_what_the_base_install_has(path):
+def test_the_client_imports_only_base_dependencies(path):
     for node in ast.walk(ast.parse(path.read_text("utf-8"))):
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]

@@ -1,4 +1,4 @@
-"""Which errors of a connection that is made anew are waited out."""
+"""Connection errors that are retried."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from real2sim.errors import ErrorDetails, error_for
         (500, "INTERNAL", False),
     ],
 )
-def test_what_a_worker_or_its_proxy_answers_may_pass(status, code, passes):
+def test_transient_errors_are_recognised(status, code, passes):
     assert is_transient(error_for(ErrorDetails(status, code, "no"))) == passes
 
 
-def test_a_worker_is_tried_until_it_is_there_again(monkeypatch):
+def test_reconnecting_retries_until_the_worker_is_back(monkeypatch):
     bad_gateway = error_for(ErrorDetails(502, "UNKNOWN", "bad gateway"))
     monkeypatch.setattr("real2sim._sync.transport.sleep", lambda _seconds: None)
     outcomes = [real2sim.UnreachableError("nobody"), bad_gateway, None]
@@ -41,7 +41,7 @@ def test_a_worker_is_tried_until_it_is_there_again(monkeypatch):
     assert not outcomes
 
 
-def test_a_refusal_is_final():
+def test_a_refusal_is_not_retried():
     def connect() -> None:
         raise error_for(ErrorDetails(410, "SESSION_CLOSED", "it is over"))
 
@@ -52,7 +52,7 @@ def test_a_refusal_is_final():
 @pytest.mark.parametrize(
     ("status", "code"), [(503, "STORAGE_UNAVAILABLE"), (503, "UNKNOWN")], ids=["worker", "proxy"]
 )
-def test_a_store_that_is_away_is_waited_for(monkeypatch, status, code):
+def test_an_unavailable_store_is_retried(monkeypatch, status, code):
     monkeypatch.setattr("real2sim._sync.transport.sleep", lambda _seconds: None)
     away = error_for(ErrorDetails(status, code, "away"))
     outcomes = [away, away, "obs"]
@@ -70,7 +70,7 @@ def test_a_store_that_is_away_is_waited_for(monkeypatch, status, code):
 @pytest.mark.parametrize(
     ("code", "seconds"), [("STORAGE_UNAVAILABLE", 0.0), ("TOO_MANY_SESSIONS", 60.0)]
 )
-def test_nobody_waits_who_does_not_want_to_or_for_room(code, seconds):
+def test_zero_seconds_or_a_capacity_error_means_no_retry(code, seconds):
     asked = []
 
     def ask() -> None:

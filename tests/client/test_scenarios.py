@@ -1,4 +1,4 @@
-"""Scenario handles against a worker that keeps a history."""
+"""Scenario handles against a worker with a history."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .fake_worker import FakeWorker
 pytestmark = pytest.mark.network
 
 
-def test_edits_send_the_revision_that_the_handle_knows(worker: FakeWorker) -> None:
+def test_edits_send_the_revision_of_the_handle(worker: FakeWorker) -> None:
     with real2sim.connect(worker.url) as client:
         scenario = client.scenarios.create(scene="street")
         scenario.objects["car_3"].translate(y=3.2)
@@ -48,7 +48,7 @@ def test_each_method_sends_its_operation(worker: FakeWorker) -> None:
     assert (sent[4]["new_id"], sent[4]["y"]) == ("second", 4.0)
 
 
-def test_a_duplicate_is_a_handle_of_its_own(worker: FakeWorker) -> None:
+def test_a_duplicate_has_its_own_handle(worker: FakeWorker) -> None:
     with real2sim.connect(worker.url) as client:
         scenario = client.scenarios.create(scene="street")
         copy = scenario.objects["car_3"].duplicate(y=4.0)
@@ -57,7 +57,7 @@ def test_a_duplicate_is_a_handle_of_its_own(worker: FakeWorker) -> None:
         assert list(scenario.objects) == ["car_3"]
 
 
-def test_a_stale_handle_is_refused_with_what_it_missed(worker: FakeWorker) -> None:
+def test_a_stale_handle_is_refused_with_the_missed_operations(worker: FakeWorker) -> None:
     with real2sim.connect(worker.url) as client:
         scenario = client.scenarios.create(scene="street")
         worker.record([{"op": "translate", "object_id": "car_3", "x": 1.0}])
@@ -69,7 +69,7 @@ def test_a_stale_handle_is_refused_with_what_it_missed(worker: FakeWorker) -> No
     assert "car_3" not in worker.objects
 
 
-def test_an_unknown_object_names_close_ones(worker: FakeWorker) -> None:
+def test_an_unknown_object_suggests_similar_names(worker: FakeWorker) -> None:
     with real2sim.connect(worker.url) as client:
         scenario = client.scenarios.create(scene="street")
         with pytest.raises(KeyError, match="did you mean car_3"):
@@ -84,7 +84,7 @@ def test_an_unknown_object_names_close_ones(worker: FakeWorker) -> None:
         ({"op": "rotate", "object_id": "car_3", "angle": 1.0, "axis": (0, 0, 0)}, "no direction"),
     ],
 )
-def test_operations_that_cannot_be_are_refused_before_they_are_sent(
+def test_invalid_operations_are_refused_before_sending(
     worker: FakeWorker, operation: dict[str, object], sentence: str
 ) -> None:
     with real2sim.connect(worker.url) as client:
@@ -94,7 +94,7 @@ def test_operations_that_cannot_be_are_refused_before_they_are_sent(
     assert worker.log == []
 
 
-def test_the_async_client_edits_alike(worker: FakeWorker) -> None:
+def test_the_async_client_edits_in_the_same_way(worker: FakeWorker) -> None:
     async def edit() -> None:
         async with real2sim.connect_async(worker.url) as client:
             scenario = await client.scenarios.create(scene="street")

@@ -1,4 +1,4 @@
-"""Memory that a worker has offered, as the client reads it."""
+"""Shared memory offered by a worker, read by the client."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ OFFER = SharedMemory(name=NAME, slots=2, slot_bytes=SLOT)
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch) -> Path:
-    """Holds the memory of a worker: ramps of greys in two slots."""
+    """Holds a worker's shared memory: grey ramps in two slots."""
     monkeypatch.setattr(_session_state, "SHM_FOLDER", str(tmp_path))
     header = (SHM_MAGIC + b"s" * 32).ljust(SHM_HEADER_BYTES, b"\0")
     (tmp_path / NAME).write_bytes(header + bytes(range(2 * SLOT)))
@@ -44,7 +44,7 @@ def frame(offset: int | None = None, height: int = 2, **changes: object) -> Fram
     return Frame.model_validate(fields | changes)
 
 
-def test_images_are_read_where_they_lie(folder):
+def test_images_are_read_in_place(folder):
     memory = SharedFrames(OFFER)
     assert memory.secret == b"s" * 32
     assert memory.lend() == 0
@@ -57,10 +57,10 @@ def test_images_are_read_where_they_lie(folder):
     assert first.data == bytes(range(24))
 
 
-def test_a_slot_is_lent_again_once_nobody_looks_at_it(folder):
+def test_a_slot_is_lent_again_once_its_views_are_gone(folder):
     memory = SharedFrames(OFFER)
     slot = memory.lend()
-    assert memory.lend() == slot  # The answer has not come yet.
+    assert memory.lend() == slot  # The answer is still pending.
     wire = frame(SHM_HEADER_BYTES + SLOT * slot)
     view = frame_from_wire(wire, *memory.pixels_of([wire])).array[0, :2]
     other = memory.lend()
@@ -73,7 +73,7 @@ def test_a_slot_is_lent_again_once_nobody_looks_at_it(folder):
     assert held[0] is not None
 
 
-def test_a_frame_can_be_handed_to_another_process(folder):
+def test_a_frame_can_be_pickled(folder):
     memory = SharedFrames(OFFER)
     wire = frame(SHM_HEADER_BYTES + SLOT * memory.lend())
     found = frame_from_wire(wire, *memory.pixels_of([wire]))
@@ -92,26 +92,26 @@ def test_a_frame_can_be_handed_to_another_process(folder):
         frame(SHM_HEADER_BYTES, shape=[-1, 4, 3]),
     ],
 )
-def test_an_image_beyond_the_slot_is_refused(folder, wrong):
+def test_an_image_outside_its_slot_is_refused(folder, wrong):
     memory = SharedFrames(OFFER)
     assert memory.lend() == 0
     with pytest.raises(MalformedReplyError, match="not in the slot"):
         memory.pixels_of([wrong])
 
 
-def test_an_image_where_no_slot_was_named_is_refused(folder):
+def test_an_image_without_a_lent_slot_is_refused(folder):
     with pytest.raises(MalformedReplyError, match="no slot"):
         SharedFrames(OFFER).pixels_of([frame(SHM_HEADER_BYTES)])
 
 
 @pytest.mark.parametrize("content", [b"", b"x" * 10_000, SHM_MAGIC])
-def test_a_file_that_is_no_memory_of_a_worker_is_not_read(folder, content):
+def test_a_file_without_a_valid_header_is_refused(folder, content):
     (folder / NAME).write_bytes(content)
     with pytest.raises(OSError, match=NAME):
         SharedFrames(OFFER)
 
 
-def test_a_link_is_not_followed(folder):
+def test_a_symbolic_link_is_refused(folder):
     (folder / NAME).rename(folder / "elsewhere")
     (folder / NAME).symlink_to(folder / "elsewhere")
     with pytest.raises(OSError, match="symbolic"):
@@ -119,10 +119,10 @@ def test_a_link_is_not_followed(folder):
 
 
 @pytest.mark.parametrize("name", ["../etc/passwd", "/etc/passwd", "real2sim-x", "a" * 41])
-def test_other_names_than_those_of_segments_are_refused(name):
+def test_an_invalid_segment_name_is_refused(name):
     with pytest.raises(ValueError, match="pattern"):
         SharedMemory(name=name, slots=1, slot_bytes=1)
 
 
-def test_a_worker_without_it_says_nothing():
+def test_a_welcome_has_no_shared_memory_by_default():
     assert Welcome.model_fields["shared_memory"].default is None

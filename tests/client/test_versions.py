@@ -1,4 +1,4 @@
-"""A client and a worker of different versions: what each sends, the other one reads."""
+"""Compatibility between clients and workers of different versions."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ ANSWERS: list[BaseModel] = [
 
 
 def with_more(value: Any) -> Any:
-    """JSON with a member that nobody knows in every object, but those that hold names."""
+    """JSON with an unknown member added to every object, except mappings of names."""
     if isinstance(value, list):
         return [with_more(item) for item in value]
     if not isinstance(value, dict):
@@ -98,12 +98,12 @@ def with_more(value: Any) -> Any:
 
 
 @pytest.mark.parametrize("answer", ANSWERS, ids=lambda answer: type(answer).__name__)
-def test_members_that_a_newer_worker_adds_are_ignored_however_deep(answer):
+def test_members_added_by_a_newer_worker_are_ignored_at_any_depth(answer):
     content = encode_json(with_more(answer.model_dump(mode="json")))
     assert read_json(type(answer), content) == answer
 
 
-def test_a_welcome_of_a_newer_worker_is_read():
+def test_a_welcome_with_unknown_members_is_read():
     welcome = Welcome(
         protocol="p",
         session_id="w0.1",
@@ -121,7 +121,7 @@ def test_a_welcome_of_a_newer_worker_is_read():
     assert server_message(encode(fields), SERVER_MESSAGE) == welcome
 
 
-def test_an_event_that_is_not_known_yet_is_an_event():
+def test_an_unknown_event_type_is_read():
     ego = {"position": (0, 0, 0), "quaternion": (1, 0, 0, 0), "size": (4, 2, 1.5)}
     ego |= dict.fromkeys(("yaw", "speed", "acceleration", "steering", "yaw_rate"), 0.0)
     fields = {"type": "obs", "step": 0, "t_us": 0, "revision": 0, "ego": ego}
@@ -132,7 +132,7 @@ def test_an_event_that_is_not_known_yet_is_an_event():
     assert message.events[0].type == "sunset"
 
 
-def test_a_session_with_options_that_are_not_known_yet_does_not_hide_the_others():
+def test_a_session_with_unknown_options_does_not_affect_others():
     fields = SessionList(sessions=[SESSION, SESSION]).model_dump(mode="json")
     reset = fields["sessions"][0]["reset"]
     reset["ego"]["dynamics"] = "articulated"
@@ -143,13 +143,13 @@ def test_a_session_with_options_that_are_not_known_yet_does_not_hide_the_others(
     assert list(first.reset.agents.drivers) == ["car_2"]
 
 
-def test_an_operation_that_is_not_known_yet_does_not_hide_the_history():
+def test_an_unknown_operation_does_not_affect_the_history():
     fields = ANSWERS[-1].model_dump(mode="json")
     fields["entries"][0]["operations"] = [{"op": "repaint"}, {"op": "delete", "object_id": "car_1"}]
     assert read_json(History, encode_json(fields)) == ANSWERS[-1]
 
 
-def test_jobs_of_kinds_and_with_errors_that_are_not_known_yet_are_read():
+def test_unknown_job_kinds_and_error_codes_are_read():
     fields = JOB.model_dump(mode="json")
     fields["kind"], fields["error"]["code"] = "reconstruct", "OUT_OF_FILM"
     job = read_json(JobInfo, encode_json(fields))
@@ -159,14 +159,14 @@ def test_jobs_of_kinds_and_with_errors_that_are_not_known_yet_are_read():
     )
 
 
-def test_an_answer_that_is_something_else_is_refused():
+def test_a_reply_of_another_shape_is_refused():
     with pytest.raises(ValidationError):
         read_json(SessionInfo, b'{"scene": "street", "reset": {"action": "fly"}}')
     with pytest.raises(MalformedReplyError, match="not a SessionInfo"):
         model_of(SessionInfo)(Reply(200, {}, b"[]"))
 
 
-def test_a_document_that_will_be_imported_again_loses_nothing_silently():
+def test_an_export_with_unknown_members_is_refused():
     entry = {"revision": 1, "kind": "edit", "created_at": "now"}
     entry["operations"] = [{"op": "delete", "object_id": "car_1", "slowly": True}]
     content = encode_json({"scene": "street", "scene_hash": "0" * 64, "entries": [entry]})
@@ -221,7 +221,7 @@ class OldMessage(Strict):
     message: Annotated[OldReset | OldAction, Field(discriminator="type")]
 
 
-def test_an_older_worker_gets_nothing_that_nobody_asked_for():
+def test_a_reset_for_an_older_worker_contains_only_set_options():
     spec = reset_spec(["front"], "jpeg", {"seed": 3, "ego": {"tracker": "lqr"}})
     request = ProtocolState().reset(spec)
     read = OldMessage.model_validate({"message": decode(request.encoded())}).message
@@ -231,13 +231,13 @@ def test_an_older_worker_gets_nothing_that_nobody_asked_for():
     assert OldMessage.model_validate({"message": sent_fields(action)}).message.step == 0
 
 
-def test_a_session_of_an_older_worker_is_made_with_what_was_asked_for_alone():
+def test_a_session_creation_contains_only_set_options():
     spec = reset_spec([], "raw", {"seed": 3})
     call = create_session("street", None, SessionCreate(reset=spec))
     assert json.loads(call.request.body) == {"reset": {"sensors": [], "seed": 3}}
 
 
-def test_an_older_worker_is_told_what_was_asked_for_even_where_it_is_the_default():
+def test_an_option_set_to_its_default_is_sent():
     spec = reset_spec([], "raw", {"contact": {"pulse": True}})
     assert sent_fields(spec) == {"sensors": [], "contact": {"pulse": True}}
 
@@ -245,7 +245,7 @@ def test_an_older_worker_is_told_what_was_asked_for_even_where_it_is_the_default
 # --- the same version --------------------------------------------------------------------------
 
 
-def test_none_is_sent_where_it_is_not_the_default():
+def test_none_is_sent_if_it_is_not_the_default():
     spec = reset_spec([], "raw", {"ego": {"suspension": None}, "start_us": None})
     assert sent_fields(spec) == {"sensors": [], "ego": {"suspension": None}}
     assert ResetSpec.model_validate(sent_fields(spec)).ego.suspension is None
@@ -259,11 +259,11 @@ def test_none_is_sent_where_it_is_not_the_default():
         Action(id=2, step=0, plan=Control(acceleration=0, steering=0, gear="reverse")),
     ],
 )
-def test_what_is_sent_says_the_same(message):
+def test_sent_fields_decode_to_the_same_message(message):
     assert CLIENT_MESSAGE.validate_python(decode(encode(sent_fields(message)))) == message
 
 
-def test_operations_keep_their_kinds():
+def test_sent_operations_keep_their_kinds():
     spawned = Spawn(recorded_id="van_0", place={"ahead": 40.0}, driver={"kind": "idm"})
     assert sent_fields(spawned) == {
         "op": "spawn",

@@ -1,4 +1,4 @@
-"""A worker under attack in this process, what it keeps, and somebody who drives beside it."""
+"""A worker under attack in this process, its resources, and a concurrent drive."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ from tests.waiting import LIMIT_S, wait_until
 
 TOKEN = "a long enough secret"
 DEAD_S = LIMIT_S
-"""After which a worker that says nothing hangs, however busy the machine is."""
+"""A worker silent for this long hangs, even on a busy machine [s]."""
 PATIENT_S = 600
 EPISODE_STEPS = 15
 SENSOR = {"camera": "front", "width": 16, "codec": "raw"}
 
 
 class Log:
-    """Everything that the worker's process says of errors; none is expected.
+    """Collects every error that the worker's process logs. None is expected.
 
     Attributes:
-        errors: told since the last :meth:`taken`.
+        errors: entries since the last :meth:`taken`.
     """
 
     def __init__(self) -> None:
@@ -58,20 +58,20 @@ class Log:
         raise structlog.DropEvent
 
     def taken(self) -> str:
-        """The errors since the last call, in one text."""
+        """Errors since the last call, as one text."""
         told, self.errors[:] = "\n".join(self.errors), []
         return told[-4000:]
 
 
 class Site:
-    """A running worker with a scene, and one of everything that clients can make.
+    """A running worker with a scene and one resource of every kind.
 
     Args:
         running: the worker.
-        log: of its process.
+        log: log of its process.
 
     Attributes:
-        known: ids by the names that parameters have.
+        known: ids by parameter name.
     """
 
     def __init__(self, running: RunningWorker, log: Log) -> None:
@@ -86,7 +86,7 @@ class Site:
         self.restore()
         self.driver = Driver(self)
 
-    # --- plain requests of somebody who means well -----------------------------------------------
+    # --- valid requests ---------------------------------------------------------------------------
 
     def ask(
         self,
@@ -97,8 +97,7 @@ class Site:
         token: str = TOKEN,
         may_conflict: bool = False,
     ) -> Any:
-        """The JSON of an answer; None where there is nothing at ``path``, or where a request that
-        ``may_conflict`` does."""
+        """The JSON body of a response. None if not found, or on a conflict if ``may_conflict``."""
         connection = http.client.HTTPConnection(*self.address, timeout=PATIENT_S)
         headers = {"Authorization": f"Bearer {token}", "Content-Type": "application/json"}
         try:
@@ -113,7 +112,7 @@ class Site:
         return json.loads(text) if text else {}
 
     def restore(self) -> None:
-        """Make anew what the attack has removed."""
+        """Create again what the attack has removed."""
         known = self.known
         if not self._has("scenarios", "scenario_id"):
             known["scenario_id"] = self.ask("POST", "/v1/scenarios", {"scene": "tiny"})[
@@ -124,7 +123,7 @@ class Site:
             made = self.ask("POST", "/v1/sessions?scene=tiny", {"reset": {"sensors": [SENSOR]}})
             known |= {"session_id": made["session_id"], "token": made["token"]}
         asset = {"scene": "tiny", "object_id": "post"}
-        # An asset whose removal is under way can be neither seen nor made.
+        # An asset that is being removed can be neither found nor created.
         wait_until(
             lambda: (
                 self._has("assets", "asset_id")
@@ -140,15 +139,15 @@ class Site:
         return name in self.known and self.ask("GET", f"/v1/{kind}/{self.known[name]}") is not None
 
     def tidy(self) -> None:
-        """Remove what the attack has made, as a client who leaves nothing behind."""
+        """Remove everything that the attack has created."""
         kept = {self.driver.session_id, *map(str, self.known.values())}
         for kind, name in (("jobs", "job_id"), ("jobs", "job_id"), ("sessions", "session_id")):
-            self._remove(kind, name, kept)  # Jobs twice: the first time cancels them.
+            self._remove(kind, name, kept)  # Delete jobs twice: the first time cancels them.
         self._remove("scenarios", "scenario_id", kept)
         self._remove("assets", "asset_id", kept)
         for scene in self.ask("GET", "/v1/scenes")["scenes"]:
             if scene["scene"] != "tiny":
-                # No call removes scenes: they are folders of the operator.
+                # No route removes scenes, which are folders of the operator.
                 self.ask("DELETE", f"/v1/scenes/{scene['scene']}/residency")
                 shutil.rmtree(self.worker.settings.scenes_path / f"{scene['scene']}.r2s")
 
@@ -160,11 +159,11 @@ class Site:
     # --- bytes ----------------------------------------------------------------------------------
 
     def connected(self) -> socket.socket:
-        """A new connection."""
+        """Open a new connection."""
         return socket.create_connection(self.address, timeout=DEAD_S)
 
     def settle(self) -> None:
-        """Wait until the event loop has come to everything that it was sent."""
+        """Wait until the event loop has handled everything sent so far."""
         self._beside.request("GET", "/livez")
         answer = self._beside.getresponse()
         answer.read()
@@ -172,7 +171,7 @@ class Site:
 
 
 class Driver:
-    """Somebody who drives in a session of its own; each episode is the same as the first."""
+    """A client that drives its own session. Every episode equals the first."""
 
     def __init__(self, site: Site) -> None:
         made = site.ask("POST", "/v1/sessions?scene=tiny")
@@ -190,7 +189,7 @@ class Driver:
             pass
 
     def drive(self) -> None:
-        """One step further. Raises AssertionError where it is not the step it was before."""
+        """Drive one step. Raises AssertionError if it differs from the first episode."""
         if self._step in (-1, EPISODE_STEPS):
             if self._step == EPISODE_STEPS:
                 self._first = self._first or self._poses
@@ -220,7 +219,7 @@ class Driver:
 
 @contextlib.contextmanager
 def attacked(folder: Path) -> Iterator[Site]:
-    """A worker with small limits on a state folder below ``folder``."""
+    """A worker with low limits and a state folder below ``folder``."""
     street = readers.scene()
     save_scene(street, folder / "scenes" / "tiny.r2s")
     (folder / "import").mkdir()

@@ -1,4 +1,4 @@
-"""Runs targets in a process of their own, and fails with what they found."""
+"""Run fuzz targets in separate processes, and fail on their findings."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NU
 
 
 def check_target(name: str, config, *, drive: Path | None = None, inputs: int = 2000) -> None:
-    """Give a reader ``inputs`` damaged inputs, or as many as ``REAL2SIM_FUZZ_INPUTS`` says."""
+    """Give a reader ``inputs`` damaged inputs, or ``REAL2SIM_FUZZ_INPUTS`` if set."""
     corpus = corpus_folder(config)
     options = ["--drive", drive] if drive is not None else []
     _check(_run("run_target.py", name, "--corpus", corpus, *options, inputs=_inputs(inputs)))
 
 
 def corpus_folder(config) -> Path:
-    """Where inputs of interest are kept from run to run."""
+    """Folder for inputs of interest, kept between runs."""
     if given := os.environ.get("REAL2SIM_FUZZ_CORPUS"):
         return Path(given)
     cache = getattr(config, "cache", None)  # None with ``-p no:cacheprovider``.
@@ -32,7 +32,7 @@ def corpus_folder(config) -> Path:
 
 
 def check_service(*names: str, inputs: int) -> None:
-    """Give a worker ``inputs`` damaged inputs by each of the ways that are named."""
+    """Attack a worker with ``inputs`` damaged inputs for each named target."""
     for report in _run("run_service.py", *names, inputs=inputs):
         _check(report)
         assert report["steps_beside"] > 0

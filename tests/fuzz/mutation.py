@@ -1,4 +1,4 @@
-"""Damage: bytes, JSON values and msgpack values that are nearly right."""
+"""Mutations of bytes, JSON values and msgpack values."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ FLOATS = (float("nan"), float("inf"), -float("inf"), 0.0, -0.0, 3.4e38, 1e-45, -
 
 
 def damaged_bytes(data: bytes, others: list[bytes], rng: random.Random) -> bytes:
-    """``data`` after one to four small injuries; ``others`` gives material to splice in."""
+    """``data`` after one to four small mutations. ``others`` provides material to splice in."""
     for _ in range(rng.choice((1, 1, 2, 4))):
         injury = rng.choice((_flip, _byte, _number, _float, _cut, _drop, _double, _splice, _text))
         data = injury(data, others, rng)
@@ -84,7 +84,7 @@ def _splice(data: bytes, others: list[bytes], rng: random.Random) -> bytes:
 
 
 def _text(data: bytes, others: list[bytes], rng: random.Random) -> bytes:
-    """Another number in place of a decimal one."""
+    """Replace a decimal digit with another number."""
     digits = [k for k, b in enumerate(data[:4096]) if 48 <= b <= 57]
     if not digits:
         return data
@@ -94,7 +94,7 @@ def _text(data: bytes, others: list[bytes], rng: random.Random) -> bytes:
 
 
 def damaged_json(data: bytes, rng: random.Random) -> bytes:
-    """A JSON text with one to three other values; not JSON, it comes back as it is."""
+    """A JSON text with one to three changed values. Returns the input if it is not JSON."""
     try:
         tree = json.loads(data)
     except (ValueError, RecursionError):
@@ -105,7 +105,7 @@ def damaged_json(data: bytes, rng: random.Random) -> bytes:
 
 
 def damaged_msgpack(data: bytes, rng: random.Random) -> bytes:
-    """A message with one to three other values, arrays among them."""
+    """A message with one to three changed values, including arrays."""
 
     def other() -> Any:
         if rng.random() < 0.3:
@@ -124,7 +124,7 @@ def damaged_msgpack(data: bytes, rng: random.Random) -> bytes:
 
 
 def _damaged_tree(tree: Any, rng: random.Random, other: Callable[[], Any]) -> Any:
-    """A copy of containers along one way down, with another value at its end."""
+    """A copy of nested containers with one changed value at the end of a random path."""
     if isinstance(tree, dict) and tree and rng.random() < 0.95:
         key = rng.choice(list(tree))
         kind = rng.random()
@@ -147,5 +147,5 @@ def _damaged_tree(tree: Any, rng: random.Random, other: Callable[[], Any]) -> An
 
 
 def shape_of(text: str) -> str:
-    """What is said, without the numbers and names that it is said of."""
+    """An error message without its numbers and names."""
     return re.sub(r"[0-9]+|'[^']*'|\"[^\"]*\"", "#", text)[:120]

@@ -1,7 +1,8 @@
-"""Every reader of files as a target: valid small samples, how it is read, the errors it may raise.
+"""Fuzz targets for all file readers: valid samples, how to read them, and documented errors.
 
-A sample is parts by name: the file itself, or what an archive, a compressed stream or a folder
-holds. Parts are damaged and put together again, so that checksums of the wrapping hide nothing.
+A sample consists of named parts: the file itself, or the content of an archive, a compressed stream
+or a folder. Parts are damaged and then reassembled, so that checksums of the container do not hide
+the damage.
 """
 
 from __future__ import annotations
@@ -45,14 +46,14 @@ MIB = 1 << 20
 
 @dataclass(frozen=True)
 class Target:
-    """A reader.
+    """A reader under test.
 
     Attributes:
-        name: of the target.
-        sample: makes the parts of valid files in an empty folder.
-        write: puts parts together below a folder; what is read.
-        read: reads it, and does with it what follows in the program.
-        errors: that it documents.
+        name: name of the target.
+        sample: writes the parts of valid files to an empty folder.
+        write: assembles parts below a folder. Returns the path to read.
+        read: reads it, and processes it as the program does.
+        errors: documented errors.
     """
 
     name: str
@@ -70,13 +71,13 @@ def scene() -> Any:
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     whole = module.make_tiny_scene()
-    # Small tensors, so that damage meets headers as often as values.
+    # Small tensors, so that damage hits headers as often as values.
     index = torch.arange(20)
     objects = {k: replace(o, cloud=o.cloud.select(index)) for k, o in whole.objects.items()}
     return replace(whole, background=whole.background.select(index), objects=objects)
 
 
-# --- putting together -------------------------------------------------------------------------
+# --- assembly ---------------------------------------------------------------------------------
 
 
 def plain(suffix: str) -> Callable[[Parts, Path], Path]:
@@ -109,7 +110,7 @@ def gzipped(suffix: str) -> Callable[[Parts, Path], Path]:
 
 
 def bundle(parts: Parts, folder: Path) -> Path:
-    """A bundle whose content has the hash that it gives, as damage on purpose would have."""
+    """A bundle whose hash matches its damaged content, as a deliberate attack would have."""
     path = folder / "file.r2s"
     path.mkdir(exist_ok=True)
     for file in path.iterdir():
@@ -403,7 +404,7 @@ def _targets() -> list[Target]:
 
     scene_errors, log_errors = (SceneError,), (LogError,)
     splat = read_splats_as_asset
-    # These are read by a process with a limit of memory, whose caller makes an error of this.
+    # Read by a process with a memory limit, whose caller converts this into an error.
     confined = (MemoryError,)
     return [
         Target("ply", splats(".ply"), plain(".ply"), splat, scene_errors),
@@ -472,7 +473,7 @@ def _targets() -> list[Target]:
 
 
 def sweep_space_sample(_folder: Path) -> list[Parts]:
-    """A space of each kind of parameter."""
+    """A space with each kind of parameter."""
     text = b"""case: {name: c, scene: s, reset: {agents: {drivers: {a: {kind: hard_brake}}}}}
 parameters:
   gap: {path: agents.drivers.a.gap, low: 5, high: 20}
@@ -486,14 +487,14 @@ method: {kind: sobol, count: 8}
 
 
 def read_sweep_space(path: Path) -> Any:
-    """As ``real2sim sweep`` begins."""
+    """Read as at the start of ``real2sim sweep``."""
     from real2sim_server.sweeps import load_sweep
 
     return load_sweep(path)
 
 
 def openscenario_sample(_folder: Path) -> list[Parts]:
-    """A file of each family of the gallery."""
+    """One file for each family of the gallery."""
     from real2sim_server.scenarios.gallery import GALLERY
     from real2sim_server.scenarios.openscenario import write_openscenario
 
@@ -502,7 +503,7 @@ def openscenario_sample(_folder: Path) -> list[Parts]:
 
 
 def read_scenario_file(path: Path) -> Any:
-    """As a worker reads an uploaded file: its values are those of its parameters."""
+    """Read as an uploaded file: values come from its parameters."""
     from real2sim_proto.storyboard import resolved
     from real2sim_server.scenarios.openscenario import read_openscenario_text
 
@@ -520,14 +521,14 @@ def journal_sample(folder: Path) -> list[Parts]:
 
 
 def read_journal(path: Path) -> Any:
-    """As a sweep goes on."""
+    """Read as when a sweep resumes."""
     from real2sim_server.sweeps.sweep import Journal
 
     return Journal(path).rows
 
 
 def map_targets() -> list[Target]:
-    """One for each format of maps, on the small valid file of its tests."""
+    """One target for each map format, with the small valid file of its tests."""
     from real2sim_server.maps import MAP_READERS, MapError, read_map
 
     place = TESTS / "server/maps/test_other_readers.py"
@@ -560,7 +561,7 @@ def map_targets() -> list[Target]:
 
 
 def spz_as_it_is(folder: Path) -> list[Parts]:
-    """Files of version 3 with their gzip stream to damage."""
+    """Files of version 3, with their gzip stream as the part to damage."""
     return [{"file": gzip.compress(p["file"], 9, mtime=0)} for p in splats(".spz")(folder)]
 
 
@@ -574,7 +575,7 @@ def as_it_is(sample: Callable[[Path], list[Parts]]) -> Callable[[Path], list[Par
 
 
 def log_target(name: str, drive: Path) -> Target:
-    """A log reader on a drive that was written in its layout; ``drive`` is damaged in place."""
+    """A log reader for a drive in its layout. ``drive`` is damaged in place."""
     from real2sim_server.logs import LogError, open_log
 
     files = sorted(p for p in drive.rglob("*") if p.is_file())
@@ -602,7 +603,7 @@ def log_target(name: str, drive: Path) -> Target:
 
 
 def target(name: str, drive: Path | None) -> Target:
-    """The target of a name; of a log reader on ``drive``."""
+    """The target of this name. Log readers use ``drive``."""
     if drive is not None:
         return log_target(name, drive)
     return {t.name: t for t in _targets()}[name]

@@ -1,4 +1,4 @@
-"""Requests that are nearly right: calls of the published description, damaged."""
+"""Mutations of the requests in the OpenAPI document."""
 
 from __future__ import annotations
 
@@ -49,14 +49,14 @@ HEADERS = {
 METHODS = ("GET", "POST", "PUT", "PATCH", "DELETE", "HEAD", "OPTIONS", "TRACE", "CONNECT", "X" * 99)
 SIMPLE = METHODS[:5]
 BUSY = frozenset({"QUEUE_FULL", "OVER_CAPACITY", "QUOTA_EXCEEDED", "UNSUPPORTED"})
-"""Codes of 5xx that the worker announces. Without memory, and in trouble, it may not be."""
+"""Allowed error codes with status 5xx. A healthy worker gives no others."""
 QUIET_S = 0.03
-"""For an answer to a request that may never have been whole."""
+"""Timeout for the response to a request that may be incomplete [s]."""
 
 
 @dataclass(frozen=True)
 class Call:
-    """A request before it is bytes."""
+    """A request before serialization."""
 
     method: str
     path: str
@@ -65,7 +65,7 @@ class Call:
     body: bytes = b""
 
     def data(self) -> bytes:
-        """As it is sent, with its true length."""
+        """The serialized request, with a correct length."""
         query = "&".join(f"{name}={value}" for name, value in self.query)
         target = self.path + (f"?{query}" if query else "")
         headers = dict(self.headers)
@@ -78,13 +78,13 @@ class Call:
         return "\r\n".join([*lines, "", ""]).encode("latin-1") + self.body
 
     def is_whole(self) -> bool:
-        """Whether there must be an answer: no header says that more is to come."""
+        """Whether a response is required, because no header announces more data."""
         odd = {"Transfer-Encoding", "Upgrade", "Connection", "Host", "Expect"}
         return self.method in SIMPLE and not any(name in odd for name, _ in self.headers)
 
 
 def described_calls(site: Site) -> list[Call]:
-    """A valid request for each call of the published description."""
+    """A valid request for each call of the OpenAPI document."""
     calls = []
     for path, item in site.ask("GET", "/openapi.json")["paths"].items():
         for method, operation in item.items():
@@ -110,7 +110,7 @@ def _described(site: Site, path: str, method: str, operation: dict[str, Any]) ->
 
 
 def _of_site(value: Any, site: Site) -> Any:
-    """An example of the description with names that this worker knows."""
+    """An example of the document, with names that this worker knows."""
     if isinstance(value, dict):
         return {k: _of_site(v, site) for k, v in value.items()}
     if isinstance(value, list):
@@ -127,7 +127,7 @@ def _of_site(value: Any, site: Site) -> Any:
 
 
 def damaged_call(call: Call, calls: list[Call], rng: random.Random) -> Call:
-    """One to three parts of a request changed."""
+    """Mutate one to three parts of a request."""
     for _ in range(rng.choice((1, 1, 1, 2, 3))):
         damages: list[Callable[[Call, list[Call], random.Random], Call]] = [_path, _query, _header]
         damages += [_json] * 4 * bool(call.body) + [_body] + [_method] * (rng.random() < 0.3)
@@ -182,7 +182,7 @@ def _method(call: Call, calls: list[Call], rng: random.Random) -> Call:
 
 
 def damaged_request(calls: list[Call], rng: random.Random) -> bytes:
-    """The bytes of one or two requests, with damage that does not spare their framing."""
+    """Bytes of one or two requests, with damage that includes their framing."""
     data = b"".join(rng.choice(calls).data() for _ in range(rng.choice((1, 1, 2))))
     kind = rng.random()
     if kind < 0.1:
@@ -202,19 +202,19 @@ def damaged_request(calls: list[Call], rng: random.Random) -> bytes:
 
 @dataclass
 class Uploads:
-    """Forms with splat files, nearly right."""
+    """Upload forms with mutated splat files."""
 
     files: list[tuple[str, bytes]] = field(default_factory=list)
 
     def load(self, folder: Path) -> None:
-        """Make the files."""
+        """Create the files."""
         for suffix in (".ply", ".spz", ".splat"):
             for parts in readers.splats(suffix)(folder)[:1]:
                 path = readers.plain(suffix)(parts, folder)
                 self.files.append((f"car{suffix}", path.read_bytes()))
 
     def call(self, number: int, rng: random.Random) -> Call:
-        """An upload with its file, its fields or its form damaged."""
+        """An upload with a damaged file, fields or form."""
         name, data = rng.choice(self.files)
         path, fields = "/v1/assets", {"category": "car", "asset_id": f"a{number}"}
         if rng.random() < 0.3:
@@ -240,20 +240,20 @@ class Uploads:
         return Call("POST", path, (), headers, body[: 4 << 20])
 
 
-# --- answers ----------------------------------------------------------------------------------
+# --- responses --------------------------------------------------------------------------------
 
 
 def answered(site: Site, data: bytes, *, whole: bool, rng: random.Random) -> str:
-    """Send a request; a word that is the same for the same answer.
+    """Send a request. Returns a word that is equal for equal responses.
 
     Args:
-        site: who gets it.
+        site: receives the request.
         data: bytes of the request.
-        whole: whether its framing is right, so that there must be an answer.
-        rng: some clients leave before they are answered.
+        whole: whether the framing is valid, so that a response is required.
+        rng: decides whether the client disconnects before the response.
 
     Raises:
-        AssertionError: the answer is one that a worker in good health does not give.
+        AssertionError: a healthy worker does not give this response.
     """
     with site.connected() as connection:
         connection.sendall(data)

@@ -1,9 +1,9 @@
-"""A worker under requests and messages that are nearly right: what it does wrong, as JSON.
+"""Fuzz a worker with mutated requests and messages. Prints its faults as JSON.
 
     python tests/fuzz/run_service.py drive view --inputs 1000 --seed 0
 
-The worker runs in this process, on loopback, under a limit of memory. Beside the attack somebody
-drives, in a session that must go on as if alone. A crash ends the process.
+The worker runs in this process, on loopback, with a memory limit. A session is driven during the
+attack and must not be affected. A crash ends the process.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from attacked_site import Site, attacked
 from run_target import DEAD_S, GROWTH_BYTES, HANG_S, limit_memory, resident
 
 BESIDE = 5
-"""Inputs between two steps of whom the attack is beside."""
+"""Number of inputs between two steps of the concurrent drive."""
 TIDY = 250
-"""Inputs between two occasions to remove what was made."""
+"""Number of inputs between two cleanups."""
 MAX_FAILURES = 20
 
 Attack = Callable[[int, random.Random], str]
@@ -55,7 +55,7 @@ def main() -> int:
 
 
 def warm_up(site: Site, attacks: dict[str, Attack], inputs: int) -> None:
-    """What is compiled or loaded at first use is not a fault of an input."""
+    """Compile and load everything first, so that it is not attributed to an input."""
     for call in rest.described_calls(site):
         site.restore()
         rest.answered(site, call.data(), whole=True, rng=random.Random(1))
@@ -108,7 +108,7 @@ def run(site: Site, name: str, attack: Attack, inputs: int, seed: int) -> dict:
 
 
 def kept_memory(site: Site) -> int:
-    """What stays resident once nobody needs anything."""
+    """Resident memory after everything has been released."""
     site.tidy()
     gc.collect()
     return resident()

@@ -1,10 +1,9 @@
-"""One reader under damaged inputs, in a process of its own: what it does wrong, as JSON.
+"""Fuzz one reader in a separate process. Prints its faults as JSON.
 
     python tests/fuzz/run_target.py ply --inputs 1000 --seed 0 --corpus FOLDER
 
-A crash or a hang ends this process; the input at work then lies in the corpus folder as
-``current``.
-Inputs that made the reader say something new are kept there and damaged further by the next run.
+A crash or a hang ends this process. The current input is then in the corpus folder as ``current``.
+Inputs with a new outcome are kept there and mutated further in the next run.
 """
 
 from __future__ import annotations
@@ -29,9 +28,9 @@ import readers
 
 MEMORY_BYTES = 2 << 30
 HANG_S = 20.0
-"""Of processor time, for what takes milliseconds: a loop that damage makes endless, or long."""
+"""CPU time [s] that counts as a hang. Normal inputs take milliseconds."""
 DEAD_S = 120.0
-"""After which a reader that is still at it hangs, however busy the machine is."""
+"""A reader still running after this time hangs, even on a busy machine [s]."""
 MAX_KEPT = 500
 MAX_PART_BYTES = 1 << 20
 GROWTH_BYTES = 256 << 20
@@ -70,7 +69,7 @@ def run(target: readers.Target, folder: Path, corpus: Path, inputs: int, seed: i
     settled = 0
     for number in range(inputs):
         rng = random.Random(f"{seed} {target.name} {number}")
-        # Most damage that goes deep is done to what is whole.
+        # Mutations of valid inputs reach deepest, so they are preferred.
         base = rng.choice(valid if rng.random() < 0.6 else samples)
         parts = damaged(base, samples, rng)
         (corpus / "current").write_bytes(pickle.dumps(parts))
@@ -100,7 +99,7 @@ def run(target: readers.Target, folder: Path, corpus: Path, inputs: int, seed: i
 
 
 def damaged(parts: readers.Parts, samples: list, rng: random.Random) -> readers.Parts:
-    """A copy with one part damaged, left out or in the place of another."""
+    """A copy with one part damaged, missing or replaced by another."""
     parts = dict(parts)
     if not parts:
         return parts
@@ -123,7 +122,7 @@ def damaged(parts: readers.Parts, samples: list, rng: random.Random) -> readers.
 
 
 def attempt(target: readers.Target, parts: readers.Parts, folder: Path) -> tuple[str, str, float]:
-    """What came of it in a word that is the same for the same reason, the failure, seconds."""
+    """Outcome (a word that is equal for equal reasons), failure, and seconds."""
     path = target.write(parts, folder)
     faulthandler.dump_traceback_later(DEAD_S, exit=True)
     started = time.process_time()

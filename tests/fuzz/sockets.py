@@ -1,4 +1,4 @@
-"""Clients of the drive and the view socket that say what is nearly right."""
+"""Clients that send mutated messages to the drive and view sockets."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from real2sim_proto import DRIVE_SUBPROTOCOL, decode, encode
 TEXT, BINARY, CLOSE, PING, PONG = 1, 2, 8, 9, 10
 LIMIT = 1 << 20
 QUIET_S = 0.03
-"""For an answer to bytes that may be no frame."""
+"""Timeout for the answer to bytes that may not be a frame [s]."""
 ODD_TEXTS = (
     "", "{", "[]", "7", "null", '{"type":"hello","token":"\\ud800"}', "[" * 100_000, "\x00",
     '{"a":' * 50_000, '{"type":"hello","token":' + "9" * 5000 + "}", '"\\u0000"', "\U0010ffff",
@@ -34,7 +34,7 @@ ODD_BYTES = (
 
 
 def frame(kind: int, data: bytes, *, last: bool = True, flags: int = 0) -> bytes:
-    """A masked frame of a client (RFC 6455, 5.2)."""
+    """A masked client frame (RFC 6455, 5.2)."""
     first = (0x80 if last else 0) | flags | kind
     n = len(data)
     if n < 126:
@@ -51,13 +51,13 @@ class Left(Exception):
 
 
 class Client:
-    """A socket of a client, one message at a time.
+    """A client socket, one message at a time.
 
     Args:
-        site: with the worker.
-        path: of the socket.
-        protocol: that is offered.
-        shake: what is done to the handshake.
+        site: site of the worker.
+        path: path of the socket.
+        protocol: offered subprotocol.
+        shake: mutation of the handshake.
     """
 
     def __init__(self, site: Site, path: str, *, protocol: str = "", shake: Any = None) -> None:
@@ -85,12 +85,12 @@ class Client:
         self.connection.settimeout(DEAD_S)
 
     def send(self, data: bytes) -> None:
-        """Bytes as they are."""
+        """Send raw bytes."""
         with contextlib.suppress(ConnectionError):
             self.connection.sendall(data)
 
     def message(self) -> tuple[int, bytes]:
-        """Kind and content of the next message. Raises Left, with the code and the reason."""
+        """Opcode and content of the next message. Raises Left with the code and the reason."""
         while True:
             while (found := self._frame()) is None:
                 self._receive()
@@ -103,7 +103,7 @@ class Client:
                 return kind, data
 
     def close(self, *, hard: bool = False) -> None:
-        """Leave without a word; ``hard``: by a reset."""
+        """Disconnect without a close frame. ``hard``: with a reset."""
         if hard and self.connection.fileno() >= 0:
             linger = struct.pack("ii", 1, 0)
             self.connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, linger)
@@ -138,7 +138,7 @@ class Client:
 
 
 class Drive:
-    """A controller who says what is nearly right, on one socket as long as it lasts."""
+    """A controller that sends mutated messages on one socket until it is closed."""
 
     KINDS = ("hello", "reset", "action", "edit", "render", "agent", "snapshot", "restore")
     LAST = ("fork", "bye")
@@ -150,7 +150,7 @@ class Drive:
         self._now = 0
 
     def attack(self, rng: random.Random) -> str:
-        """One damaged message, or a damaged hello; what came of it."""
+        """Send one damaged message or hello. Returns the outcome."""
         if self._client is None or rng.random() < 0.05:
             damaged = rng.random() < 0.5
             try:
@@ -194,7 +194,7 @@ class Drive:
 
     def _message(self, rng: random.Random) -> tuple[int, bytes]:
         reset, action = self.KINDS[1:3]
-        if rng.random() < 0.25:  # What is right, so that the next damage goes deeper.
+        if rng.random() < 0.25:  # A valid message, so that the next damage reaches deeper.
             return BINARY, encode(self._right(reset if rng.random() < 0.3 else action, rng))
         kind = rng.choice((*self.KINDS, *self.KINDS, *self.KINDS, *self.LAST))
         return _damaged(encode(self._right(kind, rng)), rng)
@@ -232,7 +232,7 @@ class Drive:
         client = self._client
         assert client is not None
         way = rng.random()
-        if way < 0.03:  # Leave while the answer is made.
+        if way < 0.03:  # Disconnect while the answer is computed.
             client.send(frame(kind, data))
             client.close(hard=way < 0.015)
             raise Left("left")
@@ -276,14 +276,14 @@ def _damaged(data: bytes, rng: random.Random) -> tuple[int, bytes]:
 
 
 class View:
-    """A browser that asks what is nearly right, on one socket as long as it lasts."""
+    """A browser that sends mutated requests on one socket until it is closed."""
 
     def __init__(self, site: Site) -> None:
         self._site = site
         self._client: Client | None = None
 
     def attack(self, rng: random.Random) -> str:
-        """One damaged question, or a damaged hello; what came of it."""
+        """Send one damaged request or hello. Returns the outcome."""
         hello = json.dumps({"type": "hello", "token": TOKEN}).encode()
         try:
             if self._client is None or rng.random() < 0.05:
@@ -348,11 +348,11 @@ class View:
                 return str(said["type"])
 
 
-# --- bytes that are not frames -----------------------------------------------------------------
+# --- invalid frames -----------------------------------------------------------------------------
 
 
 def odd_frames(site: Site, rng: random.Random) -> str:
-    """A handshake or frames with damage to their bytes; what came of it."""
+    """Send a handshake or frames with damaged bytes. Returns the outcome."""
     is_view = rng.random() < 0.5
     kind = "scenarios" if is_view else "sessions"
     known = site.known["scenario_id" if is_view else "session_id"]

@@ -1,8 +1,8 @@
-"""Damaged files of every kind: each reader refuses them by its own error, in time and in memory.
+"""Every reader refuses damaged files with its documented errors, within limits of time and memory.
 
-``REAL2SIM_FUZZ_INPUTS`` (2000 for each reader) and ``REAL2SIM_FUZZ_SEED`` (0) say how many inputs
-and which; ``REAL2SIM_FUZZ_CORPUS`` is the folder in which inputs of interest are kept from run to
-run.
+``REAL2SIM_FUZZ_INPUTS`` (default 2000 per reader) sets the number of inputs, ``REAL2SIM_FUZZ_SEED``
+(default 0) the seed, and ``REAL2SIM_FUZZ_CORPUS`` the folder that keeps inputs of interest between
+runs.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ NAMES = (
 )  # fmt: skip
 
 
-def test_without_a_cache_of_pytest_there_is_a_place_for_the_corpus(monkeypatch, tmp_path):
+def test_without_a_pytest_cache_the_corpus_is_below_out(monkeypatch, tmp_path):
     monkeypatch.delenv("REAL2SIM_FUZZ_CORPUS", raising=False)
     monkeypatch.setattr(check, "REPOSITORY", tmp_path)
     assert check.corpus_folder(SimpleNamespace()) == tmp_path / "out/fuzz"

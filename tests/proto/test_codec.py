@@ -28,25 +28,25 @@ def packed_array(*parts: object) -> bytes:
 
 
 @given(st.dictionaries(st.text(), values, max_size=5))
-def test_plain_messages_survive_the_wire(message):
+def test_plain_messages_round_trip(message):
     assert decode(encode(message)) == message
 
 
 @given(arrays)
-def test_arrays_survive_the_wire_bit_for_bit(array):
+def test_arrays_round_trip_bit_for_bit(array):
     received = decode(encode({"a": array}))["a"]
     assert received.dtype == array.dtype
     assert received.shape == array.shape
     assert received.tobytes() == array.tobytes()
 
 
-def test_big_endian_and_strided_arrays_arrive_with_the_same_values():
+def test_big_endian_and_strided_arrays_keep_their_values():
     array = np.arange(24, dtype=">f4").reshape(4, 6)[::2, ::-3]
     np.testing.assert_array_equal(decode(encode({"a": array}))["a"], array)
 
 
 @pytest.mark.parametrize("size", [0, 3, codec.SMALL_ARRAY_BYTES // 8, codec.SMALL_ARRAY_BYTES])
-def test_an_array_of_any_size_and_order_is_dtype_shape_and_bytes_in_c_order(size):
+def test_arrays_are_encoded_as_dtype_shape_and_c_order_bytes(size):
     for array in (np.arange(size, dtype=">f8"), np.arange(2.0 * size).reshape(2, size).T):
         data = array.astype("<f8").tobytes()
         assert encode({"a": array}) == packed_array("<f8", list(array.shape), data)
@@ -58,25 +58,25 @@ def test_received_arrays_are_read_only_views():
         received[0] = 1
 
 
-def test_numpy_scalars_travel_as_arrays_of_no_dimension():
+def test_numpy_scalars_are_encoded_as_zero_dimensional_arrays():
     assert decode(encode({"a": np.float32(1.5)}))["a"].shape == ()
 
 
 @pytest.mark.parametrize(
     "value", [object(), {1, 2}, np.array([object()]), np.array(["text"]), np.zeros(2, complex)]
 )
-def test_values_without_a_place_on_the_wire_are_refused(value):
+def test_unsupported_values_are_refused(value):
     with pytest.raises(CodecError, match="cannot be encoded"):
         encode({"a": value})
 
 
-def test_a_message_over_the_size_cap_names_both_sizes():
+def test_an_oversized_message_is_refused_with_both_sizes():
     with pytest.raises(CodecError, match=r"103 bytes is larger than the allowed 100"):
         decode(b"\x00" * 103, max_bytes=100)
 
 
 @pytest.mark.parametrize("data", [b"", b"\xc1", b"\x81\xa1a", encode({"a": 1}) + b"\x00"])
-def test_bytes_that_are_no_single_msgpack_value_are_refused(data):
+def test_bytes_other_than_one_msgpack_value_are_refused(data):
     with pytest.raises(CodecError, match="not valid msgpack"):
         decode(data)
 
@@ -91,7 +91,7 @@ def test_map_keys_must_be_strings():
         decode(msgpack.packb({"a": {1: 2}}))
 
 
-def test_nesting_up_to_the_cap_is_allowed_and_one_more_is_not():
+def test_nesting_over_the_depth_limit_is_refused():
     def nested(levels: int) -> dict:
         value: object = 0
         for _ in range(levels):
@@ -103,7 +103,7 @@ def test_nesting_up_to_the_cap_is_allowed_and_one_more_is_not():
         decode(msgpack.packb(nested(MAX_DEPTH + 1)))
 
 
-def test_very_deep_bytes_do_not_overflow_the_stack():
+def test_extreme_nesting_does_not_overflow_the_stack():
     with pytest.raises(CodecError):
         decode(b"\x81\xa1a" + b"\x91" * 100_000 + b"\x00")
 
@@ -122,12 +122,12 @@ def test_very_deep_bytes_do_not_overflow_the_stack():
         (("<f4", [1], "text"), "must be"),
     ],
 )
-def test_arrays_whose_parts_disagree_are_refused(parts, reason):
+def test_arrays_with_inconsistent_parts_are_refused(parts, reason):
     with pytest.raises(CodecError, match=reason):
         decode(packed_array(*parts))
 
 
-def test_array_payload_that_is_no_msgpack_is_refused():
+def test_an_array_payload_that_is_not_msgpack_is_refused():
     with pytest.raises(CodecError):
         decode(msgpack.packb({"a": msgpack.ExtType(ARRAY_EXT, b"\xc1")}))
 

@@ -14,14 +14,14 @@ from real2sim_proto.scenarios import OperationBatch
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
-def test_actions_that_are_not_finite_are_refused(value):
+def test_non_finite_actions_are_refused(value):
     with pytest.raises(ValidationError):
         PLAN.validate_python({"kind": "control", "acceleration": value, "steering": 0.0})
     with pytest.raises(ValidationError):
         PLAN.validate_python({"kind": "trajectory", "times_us": [1], "poses": [[value, 0, 0]]})
 
 
-def test_a_plan_takes_arrays_and_lists_alike():
+def test_a_plan_accepts_arrays_and_lists():
     lists = {"kind": "trajectory", "times_us": [1, 2], "poses": [[0, 0, 0], [1, 0, 0]]}
     arrays = {
         "kind": "trajectory",
@@ -40,7 +40,7 @@ def test_plans_of_wrong_length_or_order_are_refused(times, poses):
         PLAN.validate_python({"kind": "trajectory", "times_us": times, "poses": poses})
 
 
-def test_a_quaternion_that_is_no_rotation_is_refused_with_its_length():
+def test_a_non_unit_quaternion_is_refused_with_its_length():
     with pytest.raises(ValidationError, match="has length 2"):
         Pose(position=(0, 0, 0), quaternion=(2, 0, 0, 0))
 
@@ -55,23 +55,23 @@ def test_unknown_fields_are_refused():
         OPERATION.validate_python({"op": "delete", "object_id": "car_1", "force": True})
 
 
-def test_unknown_operations_are_refused_with_the_known_ones():
+def test_unknown_operations_are_refused_with_the_supported_ones():
     with pytest.raises(ValidationError, match="translate"):
         OPERATION.validate_python({"op": "explode", "object_id": "car_1"})
 
 
 @pytest.mark.parametrize("object_id", ["", "../etc", "a b", "x" * 81, "-car"])
-def test_ids_cannot_be_paths_or_prose(object_id):
+def test_invalid_ids_are_refused(object_id):
     with pytest.raises(ValidationError):
         operations.Delete(object_id=object_id)
 
 
-def test_a_rotation_needs_an_axis():
+def test_a_rotation_with_a_zero_axis_is_refused():
     with pytest.raises(ValidationError, match="no direction"):
         operations.Rotate(object_id="car_1", angle=1.0, axis=(0, 0, 0))
 
 
-def test_batches_are_capped():
+def test_batches_must_have_1_to_256_operations():
     one = {"op": "delete", "object_id": "a"}
     with pytest.raises(ValidationError):
         OperationBatch.model_validate({"operations": [one] * 257})
@@ -79,7 +79,7 @@ def test_batches_are_capped():
         OperationBatch.model_validate({"operations": []})
 
 
-def test_messages_are_told_apart_by_type():
+def test_messages_are_discriminated_by_type():
     message = CLIENT_MESSAGE.validate_python(
         {"v": 1, "type": "hello", "id": 1, "protocols": ["real2sim.v1.msgpack"]}
     )
@@ -91,18 +91,18 @@ def test_a_message_of_another_protocol_version_is_refused():
         CLIENT_MESSAGE.validate_python({"v": 2, "type": "bye", "id": 1})
 
 
-def test_mismatch_sentence_names_both_versions():
+def test_the_mismatch_message_names_both_versions():
     sentence = conventions.protocol_mismatch(["real2sim.v9.msgpack"])
     assert "real2sim.v9.msgpack" in sentence
     assert conventions.DRIVE_SUBPROTOCOL in sentence
 
 
-def test_every_error_code_has_a_status_of_an_error():
+def test_every_error_code_has_an_http_error_status():
     assert set(HTTP_STATUS) == set(ErrorCode)
     assert all(400 <= status < 600 for status in HTTP_STATUS.values())
 
 
-def test_a_problem_keeps_members_it_does_not_know():
+def test_a_problem_keeps_unknown_members():
     problem = Problem.model_validate(
         {
             "title": title_of(ErrorCode.STALE_REVISION),
@@ -116,12 +116,12 @@ def test_a_problem_keeps_members_it_does_not_know():
     assert problem.model_extra == {"missed": [1]}
 
 
-def test_a_sensor_cannot_name_a_modality_twice():
+def test_duplicate_modalities_of_a_sensor_are_refused():
     with pytest.raises(ValidationError, match="repeat"):
         drive.SensorSpec(camera="front", modalities=["rgb", "rgb"])
 
 
-def test_members_that_a_newer_worker_adds_are_ignored_and_those_of_a_client_refused():
+def test_unknown_members_are_ignored_from_workers_and_refused_from_clients():
     answer = {"v": 1, "type": "edited", "id": 1, "revision": 2, "extra": "good"}
     assert drive.SERVER_MESSAGE.validate_python(answer).revision == 2
     with pytest.raises(ValidationError, match="extra"):

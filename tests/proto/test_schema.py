@@ -16,11 +16,11 @@ HASHES = Path(__file__).resolve().parents[2] / "proto" / "contract.sha256"
 
 @cache
 def made() -> dict[str, dict[str, Any]]:
-    """The schemas of the models."""
+    """Schemas of the models."""
     return schemas()
 
 
-def test_messages_changed_only_together_with_the_recorded_contract():
+def test_schemas_match_the_recorded_hashes():
     lines = (line.split() for line in HASHES.read_text("utf-8").splitlines())
     recorded = {Path(name).stem: digest for digest, name in lines if name.startswith("schema/")}
     texts = {name: schema_text(schema) for name, schema in made().items()}
@@ -34,26 +34,26 @@ def test_every_schema_is_valid_json_schema():
 
 
 def validator(name: str) -> jsonschema.Draft202012Validator:
-    """As whoever has the folder: references are files beside the one that refers."""
+    """A validator as used with the schema folder, where references point to sibling files."""
     files = {f"{name}.json": referencing.Resource.from_contents(s) for name, s in made().items()}
     registry = referencing.Registry().with_resources(files.items())
     return jsonschema.Draft202012Validator(made()[name], registry=registry)
 
 
-def test_a_schema_refuses_what_the_model_refuses():
+def test_the_schema_of_an_operation_refuses_unknown_members():
     operation = validator("Operation")
     operation.validate({"op": "translate", "object_id": "car_1", "y": 3.2})
     with pytest.raises(jsonschema.ValidationError):
         operation.validate({"op": "translate", "object_id": "car_1", "y": 3.2, "w": 1})
 
 
-def test_a_reference_to_the_file_of_a_storyboard_is_followed():
+def test_a_reference_to_the_storyboard_schema_is_resolved():
     operation = validator("Operation")
     operation.validate({"op": "set_storyboard", "storyboard": {"entities": [{"name": "Ego"}]}})
     with pytest.raises(jsonschema.ValidationError):
         operation.validate({"op": "set_storyboard", "storyboard": {"entities": [{"nam": "Ego"}]}})
 
 
-def test_definitions_of_a_shared_message_stand_in_its_file_alone():
+def test_shared_definitions_are_only_in_their_own_file():
     for name, schema in made().items():
         assert set(SHARED).isdisjoint(schema.get("$defs", {})), name

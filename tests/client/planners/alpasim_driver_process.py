@@ -1,10 +1,10 @@
-"""A process that serves NVIDIA's own EgoDriverService, out of a checkout of NVlabs/alpasim.
+"""A process that serves NVIDIA's own EgodriverService from a checkout of NVlabs/alpasim.
 
     python alpasim_driver_process.py CHECKOUT CAMERA,... CONTEXT FOLDER [rectify]
 
-The service and all it uses of AlpaSim is theirs; what needs weights, Rust or a window is left out:
-the model drives straight on at the speed that it is told, once it has its context. Its port is
-printed when it listens. FOLDER takes their protos, compiled.
+The service and its AlpaSim dependencies are unmodified, except for parts that need weights, Rust or
+a display. The model drives straight at the reported speed once it has its context. The process
+prints its port when it listens. FOLDER receives the compiled protos.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def compile_protos(checkout: Path, folder: Path) -> None:
 
 
 def leave_out() -> None:
-    """Names that the service imports and this drive does not use, and the yaw of a quaternion."""
+    """Replace modules that this drive does not need. Only implements the yaw of a quaternion."""
     unused = {
         "pygame": [],
         "vam.action_expert": ["VideoActionModelInference"],

@@ -1,6 +1,6 @@
-"""The rule planners written out plainly: point by point and agent by agent, as they were first.
+"""Reference implementation of the rule-based planners, point by point and agent by agent.
 
-What they share with the planners under test are limits and parameters, nothing that computes.
+It shares limits and parameters with the planners under test, but no computation.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ def speed_limits(arc, points, cruise, comfort):
 
 
 def obstacles(arc, points, obs, clearance):
-    """(place, speed) of each agent in the strip, one agent at a time."""
+    """(arc length, speed) of each agent in the corridor, one agent at a time."""
     found = []
     if len(arc) < 2:
         return found

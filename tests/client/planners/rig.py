@@ -1,4 +1,4 @@
-"""Cameras on a vehicle, and what they show."""
+"""Vehicle cameras and their images."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def camera_on_vehicle(degrees: float) -> np.ndarray:
 
 
 def seen(*, position=(100.0, 50.0, 2.0), yaw=30.0, **options):
-    """An observation with an image of each of CAMERAS, level ``k`` on the k-th."""
+    """An observation with one image per camera. The k-th of CAMERAS has grey level ``10 k``."""
     T_world_ego = np.eye(4)
     T_world_ego[:3, :3], T_world_ego[:3, 3] = turned(yaw), position
     frames = {}

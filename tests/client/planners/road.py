@@ -1,4 +1,4 @@
-"""Observations of a planner, made by hand."""
+"""Hand-made observations for planners."""
 
 from __future__ import annotations
 

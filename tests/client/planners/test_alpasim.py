@@ -1,4 +1,4 @@
-"""A planner behind AlpaSim's EgodriverService, played by a small server on loopback."""
+"""The AlpaSim planner adapter against a small local EgodriverService."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ pytestmark = pytest.mark.network
 
 
 class Driver:
-    """Drives straight on along x of its local frame; keeps what it was asked.
+    """Drives straight along x of its local frame, and records all requests.
 
-    Refuses as NVIDIA's service does: sessions without the cameras that it wants, images of others,
-    and, of what it calls a rectifier, images of cameras that are not f-theta.
+    Refuses the same requests as NVIDIA's service: sessions without its cameras, images of other
+    cameras, and with rectification, images of cameras that are not f-theta.
     """
 
     def __init__(self):
@@ -109,7 +109,7 @@ def asked(driver, name):
 
 
 def sessions(driver):
-    """Those that were begun to drive, and not to ask for cameras."""
+    """Sessions for driving, without those that only query cameras."""
     begun = asked(driver, "start_session")
     return [request for request in begun if request.rollout_spec.vehicle.available_cameras]
 
@@ -118,22 +118,22 @@ def reached(driver, suffix="", **options):
     return AlpasimDriver(driver.target + suffix, timeout=LIMIT_S, **options)
 
 
-def test_it_is_found_by_name_and_wants_all_cameras(driver):
+def test_the_planner_is_found_by_name_and_needs_all_cameras(driver):
     planner = load_planner(f"alpasim={driver.target}")
     assert needs_of(planner).all_cameras
     planner.close()
 
 
-def test_poses_after_now_come_back_in_the_world(planner):
+def test_future_poses_are_returned_in_world_coordinates(planner):
     plan = planner.plan(rig.seen())
     assert plan.frame == "world"
     assert plan.times_us == [1_200_000, 1_400_000]
-    # The local frame of the driver began where the episode did.
+    # The local frame of the driver starts at the initial pose of the episode.
     assert [p[:2] for p in plan.poses] == [(102.0, 49.0), (103.0, 49.0)]
     assert [p[2] for p in plan.poses] == pytest.approx([0.2, 0.2], abs=1e-6)
 
 
-def test_the_session_tells_of_cameras_and_seed(driver, planner):
+def test_the_session_contains_cameras_and_seed(driver, planner):
     (request,) = sessions(driver)
     assert request.random_seed == 7
     assert len(request.session_uuid) == 32
@@ -150,7 +150,7 @@ def test_the_session_tells_of_cameras_and_seed(driver, planner):
         np.testing.assert_allclose([v.x, v.y, v.z], expected[:3, 3], atol=1e-5)
 
 
-def test_each_step_shows_images_motion_and_route_before_it_asks(driver, planner):
+def test_each_step_sends_images_egomotion_and_route_before_drive(driver, planner):
     planner.plan(rig.seen(position=(103.0, 50.0, 2.0), acceleration=-1.5, yaw_rate=0.1))
     kinds = [kind for kind, _ in driver.asked]
     told = ["submit_image_observation"] * 3 + ["submit_egomotion_observation", "submit_route"]
@@ -180,7 +180,7 @@ def test_each_step_shows_images_motion_and_route_before_it_asks(driver, planner)
     assert len({r.session_uuid for _, r in driven if hasattr(r, "session_uuid")}) == 1
 
 
-def test_a_new_episode_closes_the_session_before(driver, planner):
+def test_a_new_episode_closes_the_previous_session(driver, planner):
     planner.reset(rig.seen())
     first, second = (r.session_uuid for r in sessions(driver))
     assert asked(driver, "close_session")[-1].session_uuid == first
@@ -195,14 +195,14 @@ def test_a_new_episode_closes_the_session_before(driver, planner):
         (((1.0, 2.0), {"terminate": True}), "ends the session"),
     ],
 )
-def test_answers_that_are_no_way_are_refused(driver, planner, way, said):
+def test_invalid_trajectories_are_refused(driver, planner, way, said):
     xs, options = way
     driver.answer = driver.way(*xs, **options)
     with pytest.raises(PeerError, match=said):
         planner.plan(rig.seen())
 
 
-def test_nobody_there_is_said_by_address():
+def test_an_unreachable_driver_is_named_by_address():
     with pytest.raises(PeerError, match=r"get_version of the driver at 127\.0\.0\.1:9 failed"):
         AlpasimDriver("127.0.0.1:9", timeout=0.3)
 
@@ -228,7 +228,7 @@ def shown(driver):
     return [i.camera_image.logical_id for i in asked(driver, "submit_image_observation")]
 
 
-def test_a_driver_is_shown_the_cameras_that_it_wants_by_its_names(driver, infos):
+def test_a_driver_gets_the_cameras_it_requires_under_its_names(driver, infos):
     driver.wants = [LEFT, FRONT]
     planner = reached(driver)
     assert [s["camera"] for s in planner.needs.sensors(infos)] == ["left", "front"]
@@ -244,7 +244,7 @@ def test_a_driver_is_shown_the_cameras_that_it_wants_by_its_names(driver, infos)
     planner.close()
 
 
-def test_one_camera_serves_for_wide_and_tele(driver, infos):
+def test_one_camera_serves_as_wide_and_tele(driver, infos):
     driver.wants = [FRONT, "camera_front_tele_30fov"]
     planner = reached(driver)
     assert [s["camera"] for s in planner.needs.sensors(infos)] == ["front"]
@@ -254,7 +254,7 @@ def test_one_camera_serves_for_wide_and_tele(driver, infos):
     planner.close()
 
 
-def test_cameras_are_named_behind_the_target(driver, infos):
+def test_cameras_are_mapped_in_the_target(driver, infos):
     driver.wants = ["middle", FRONT]
     planner = load_planner(f"alpasim={driver.target}?cameras=middle:CAM_BACK,{FRONT}")
     assert [s["camera"] for s in needs_of(planner).sensors(infos)] == ["CAM_BACK", "front"]
@@ -269,7 +269,7 @@ def test_cameras_are_named_behind_the_target(driver, infos):
         ("middle", "?cameras=middle:roof", "camera 'roof', given for 'middle', does not exist"),
     ],
 )
-def test_a_camera_that_nothing_here_stands_for_is_said(driver, infos, wanted, suffix, said):
+def test_a_required_camera_without_a_match_is_named(driver, infos, wanted, suffix, said):
     driver.wants = [wanted]
     planner = reached(driver, suffix)
     cameras = infos if "CAM_BACK" in said else infos[:2]
@@ -278,15 +278,13 @@ def test_a_camera_that_nothing_here_stands_for_is_said(driver, infos, wanted, su
     planner.close()
 
 
-def test_an_unknown_option_behind_the_target_is_refused(driver):
+def test_an_unknown_target_option_is_refused(driver):
     with pytest.raises(ValueError, match=r"option 'camera' of .* is unknown; there is: cameras"):
         reached(driver, "?camera=front")
 
 
 @pytest.mark.parametrize("refused", [False, True])
-def test_until_its_context_is_full_a_driver_without_plan_keeps_the_vehicle_on_its_route(
-    driver, planner, refused
-):
+def test_the_vehicle_follows_its_route_until_the_driver_has_its_context(driver, planner, refused):
     driver.answer, driver.short_of_past = messages().DriveResponse(), refused
     plan = planner.plan(rig.seen(speed=6.0))
     assert plan.frame == "vehicle"
@@ -294,7 +292,7 @@ def test_until_its_context_is_full_a_driver_without_plan_keeps_the_vehicle_on_it
     assert plan.poses[-1][0] == pytest.approx(18.0, abs=0.01)
     driver.answer, driver.short_of_past = driver.way(1.0, 2.0), False
     assert planner.plan(rig.seen()).frame == "world"
-    # From then on, no plan is a failure.
+    # After the first plan, an empty one is an error.
     driver.answer = messages().DriveResponse()
     with pytest.raises(PeerError, match="plans nothing"):
         planner.plan(rig.seen())
@@ -312,7 +310,7 @@ def test_a_driver_that_never_plans_is_given_up(driver):
     planner.close()
 
 
-def test_a_driver_that_rectifies_is_told_of_f_theta_cameras(driver, planner):
+def test_a_rectifying_driver_gets_f_theta_cameras(driver, planner):
     driver.rectifies = True
     planner.plan(rig.seen())
     assert len(sessions(driver)) == 2
@@ -326,7 +324,7 @@ def test_a_driver_that_rectifies_is_told_of_f_theta_cameras(driver, planner):
 
 
 @pytest.mark.parametrize("field", [30, 70, 120])
-def test_a_pinhole_in_f_theta_is_itself(field):
+def test_an_f_theta_fit_reproduces_a_pinhole(field):
     focal = 960.0 / math.tan(math.radians(field / 2))
     K = np.array([[focal, 0, 960.0], [0, focal, 540.0], [0, 0, 1]])
     lens = Ftheta.of(K, 1920, 1080)
@@ -338,7 +336,7 @@ def test_a_pinhole_in_f_theta_is_itself(field):
     np.testing.assert_allclose(back * focal, angles * focal, atol=0.02)
 
 
-def test_a_route_that_ends_is_filled_up_with_what_is_no_number(driver, planner):
+def test_a_short_route_is_padded_with_nan(driver, planner):
     short = dataclasses.replace(rig.seen(), route=np.array([[2.0, 0.0], [10.0, 0.0]]))
     planner.plan(short)
     (route,) = asked(driver, "submit_route")
@@ -348,7 +346,7 @@ def test_a_route_that_ends_is_filled_up_with_what_is_no_number(driver, planner):
     assert all(math.isnan(x) for x in xs[3:])
 
 
-def test_the_time_of_the_next_question_follows_the_clock(driver, planner):
+def test_the_query_time_follows_the_observation_interval(driver, planner):
     planner.plan(rig.seen())
     planner.plan(dataclasses.replace(rig.seen(), t_us=1_050_000))
     first, second = asked(driver, "drive")
@@ -360,7 +358,7 @@ def nested(number: int, content: bytes) -> bytes:
     return bytes([number << 3 | 2, len(content)]) + content
 
 
-def test_bytes_on_the_wire_are_those_of_the_field_numbers_of_alpasim():
+def test_messages_use_the_field_numbers_of_alpasim():
     request = messages().DriveRequest(session_uuid="s", time_now_us=5, time_query_us=6)
     times = b"\x19" + struct.pack("<Q", 5) + b"\x21" + struct.pack("<Q", 6)
     assert request.SerializeToString() == b"\x0a\x01s" + times
@@ -375,6 +373,6 @@ def test_bytes_on_the_wire_are_those_of_the_field_numbers_of_alpasim():
 @pytest.mark.parametrize(
     "q", [(1.0, 0, 0, 0), (0.5, -0.5, 0.5, -0.5), (0.0, 0, 1, 0), (0.6, 0, 0, 0.8)]
 )
-def test_rotations_become_quaternions(q):
+def test_rotation_matrices_are_converted_to_quaternions(q):
     found = np.array(quaternion_of(quaternion_to_matrix(np.array(q))))
     assert min(np.abs(found - q).max(), np.abs(found + q).max()) < 1e-12

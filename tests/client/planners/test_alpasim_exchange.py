@@ -1,8 +1,8 @@
-"""A drive by NVIDIA's own driver service, recorded once and played back.
+"""Replays a recorded drive by NVIDIA's own driver service.
 
-``alpasim_exchange.json`` holds what the service answered, call by call, and where it came from.
-With REAL2SIM_ALPASIM naming a checkout, ``tests/server/service/sessions/test_alpasim_driver.py``
-drives by the service itself.
+``alpasim_exchange.json`` holds the answers of the service, call by call, and their origin. If
+REAL2SIM_ALPASIM names a checkout, ``tests/server/service/sessions/test_alpasim_driver.py`` drives
+with the service itself.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ EXCHANGE = json.loads(Path(__file__).with_name("alpasim_exchange.json").read_tex
 
 @pytest.fixture
 def service():
-    """Answers as recorded, and refuses calls that come out of order."""
+    """Serves recorded answers, and refuses calls in a different order."""
     left = list(EXCHANGE["calls"])
 
     def handler(name: str):
@@ -52,7 +52,7 @@ def service():
 
 
 def observations(count: int):
-    """A vehicle at 6 m/s, ten times a second."""
+    """A vehicle at 6 m/s, observed at 10 Hz."""
     for k in range(count):
         t_us = 1_000_000 + 100_000 * k
         seen = rig.seen(position=(100.0 + 0.6 * k, 50.0, 2.0), yaw=0.0)
@@ -76,7 +76,7 @@ def test_the_recorded_service_drives(service):
     target, left = service
     plans = drive(target)
     assert not left
-    # Its context is four images of each of two cameras; then it goes straight on at 6 m/s.
+    # The context is four images from each of two cameras. Then it drives straight at 6 m/s.
     assert [plan.frame for plan in plans] == ["vehicle"] * 3 + ["world"] * 3
     for k, plan in enumerate(plans[3:], start=3):
         now = 1_000_000 + 100_000 * k

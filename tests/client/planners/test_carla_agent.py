@@ -1,4 +1,4 @@
-"""Agents with the shape of the CARLA leaderboard, without CARLA."""
+"""CARLA leaderboard agents, without CARLA."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def cameras(**directions: float) -> list[CameraInfo]:
     ]
 
 
-def test_an_agent_drives_by_what_its_sensors_see(planner):
+def test_an_agent_drives_on_its_sensor_inputs(planner):
     obs = rig.seen(yaw=0.0, speed=6.0)
     planner.reset(obs)
     command = planner.plan(obs)
@@ -112,11 +112,11 @@ def test_an_agent_drives_by_what_its_sensors_see(planner):
     frame, picture = inputs["Middle"]
     assert (frame, picture.shape, picture.dtype) == (obs.step, (12, 16, 4), np.uint8)
     assert (picture[..., 3] == 255).all()
-    assert (picture[..., :3] == 0).all()  # Of the camera ahead, whose level is 0.
+    assert (picture[..., :3] == 0).all()  # From the front camera, with level 0.
     assert inputs["Speed"][1] == {"speed": 6.0}
     assert inputs["IMU"][1].shape == (7,)
     lat, lon, _ = inputs["GPS"][1]
-    # 100 m east and 50 m north of the equator's origin; the middle is 1.35 m ahead of the axle.
+    # 100 m east and 50 m north of the origin at the equator. The vehicle centre is 1.35 m ahead.
     ahead = obs.ego.size[0] / 2 - 0.95
     assert lon == pytest.approx(math.degrees((100 + ahead) / 6378137.0), rel=1e-9)
     assert lat == pytest.approx(math.degrees(50 / 6378137.0), rel=1e-6)
@@ -124,7 +124,7 @@ def test_an_agent_drives_by_what_its_sensors_see(planner):
     assert command.acceleration > 1.0
 
 
-def test_agents_of_the_first_leaderboard_set_themselves_up(tmp_path):
+def test_agents_for_the_first_leaderboard_are_set_up(tmp_path):
     file = tmp_path / "older.py"
     file.write_text(OLDER)
     planner = CarlaAgent(f"{file}?config=a.yaml")
@@ -133,7 +133,7 @@ def test_agents_of_the_first_leaderboard_set_themselves_up(tmp_path):
     assert planner._agent.config == "a.yaml"
 
 
-def test_each_episode_has_an_agent_of_its_own(planner):
+def test_each_episode_has_a_new_agent(planner):
     planner.reset(rig.seen())
     first = planner._agent
     planner.reset(rig.seen())
@@ -141,18 +141,18 @@ def test_each_episode_has_an_agent_of_its_own(planner):
     assert planner._agent is not first
 
 
-def test_cameras_that_see_the_same_way_are_asked_for_as_large_as_needed(planner):
+def test_a_matching_camera_is_requested_at_the_needed_width(planner):
     sensors = needs_of(planner).sensors(cameras(front=0.0, left=50.0, back=180.0))
-    # A focal length of 114 px is wanted, 300 px are there.
+    # The agent needs a focal length of 114 px. The camera has 300 px.
     assert sensors == [{"camera": "front", "modalities": ["rgb"], "width": 19}]
 
 
-def test_a_camera_that_nothing_sees_is_refused(planner):
+def test_an_agent_camera_without_coverage_is_refused(planner):
     with pytest.raises(PeerError, match=r"'Middle' looks where .*back.* see 0%"):
         needs_of(planner).sensors(cameras(back=180.0))
 
 
-def test_a_sensor_that_is_not_there_is_refused(tmp_path):
+def test_an_unsupported_sensor_is_refused(tmp_path):
     file = tmp_path / "agent.py"
     file.write_text(AGENT.replace("sensor.other.imu", "sensor.lidar.ray_cast"))
     with pytest.raises(PeerError, match=r"'IMU' is an unsupported 'sensor.lidar.ray_cast'"):
@@ -168,7 +168,7 @@ def test_an_agent_that_cannot_be_loaded_is_named(target, sentence):
         CarlaAgent(target)
 
 
-def test_installed_modules_are_left_alone(agent_file, monkeypatch):
+def test_installed_modules_are_not_replaced(agent_file, monkeypatch):
     own = types.ModuleType("carla")
     own.VehicleControl = VehicleControl
     monkeypatch.setitem(sys.modules, "carla", own)
@@ -178,7 +178,7 @@ def test_installed_modules_are_left_alone(agent_file, monkeypatch):
     assert set(STUBS) <= set(sys.modules)
 
 
-def test_the_route_is_carlas(planner):
+def test_the_route_is_converted_to_carla_conventions(planner):
     route = np.zeros((61, 4))
     route[:, 0], route[:, 2] = np.arange(61.0), 3.0
     route[30:, 3] = np.pi / 2
@@ -187,7 +187,7 @@ def test_the_route_is_carlas(planner):
 
     first, last = in_world[0][0], in_world[-1][0]
     assert (first.location.x, first.location.y, first.location.z) == (0.0, 0.0, 3.0)
-    # To the left of x is Unreal's minus y.
+    # Left of x is -y in Unreal.
     assert last.rotation.yaw == pytest.approx(-90.0)
     assert options[0] == options[-1] == "LANEFOLLOW"
     assert options[30] == "LEFT"
@@ -197,7 +197,7 @@ def test_the_route_is_carlas(planner):
     assert 3 <= len(planner._agent._global_plan) < 10
 
 
-def test_the_route_of_the_session_goes_to_the_agent(planner):
+def test_the_session_route_is_passed_to_the_agent(planner):
     planner.begin(types.SimpleNamespace(route=np.array([[0, 0, 0, 0], [5.0, 2.0, 1.0, 0.0]])))
     planner.reset(rig.seen())
     ends = [pose.location for pose, _ in planner._agent._global_plan_world_coord]
@@ -216,7 +216,7 @@ def test_the_route_of_the_session_goes_to_the_agent(planner):
         ((0, 0, 0), 1, (0, 0, -1)),
     ],
 )
-def test_angles_of_cameras_are_unreals(angles, axis, direction):
+def test_camera_angles_follow_the_unreal_convention(angles, axis, direction):
     R = camera_rotation(*map(math.radians, angles))
 
     assert R[:, axis] == pytest.approx(direction, abs=1e-12)
@@ -229,8 +229,8 @@ def test_the_field_of_view_is_horizontal():
     assert view.K[0, 0] == view.K[1, 1] == pytest.approx(400.0)
 
 
-def test_images_keep_directions(planner):
-    # Two cameras, one wanted between them: its left half is the left one's, its right half ...
+def test_reprojected_images_keep_directions(planner):
+    # Between two cameras: the left half comes from the left one, the right half from the right one.
     wide = np.array([[24.0, 0, 24], [0, 24.0, 16], [0, 0, 1]])
     left, right = (PinholeView(wide, (48, 32), rig.turned(d) @ rig.FORWARD) for d in (45, -45))
     wanted = PinholeView(wide, (48, 32), rig.FORWARD)
@@ -246,7 +246,7 @@ def test_images_keep_directions(planner):
     assert (seen[16, 25:] == 9).all()
 
 
-def test_a_pixel_is_looked_up_where_its_ray_points():
+def test_a_pixel_is_sampled_along_its_ray():
     K = np.array([[100.0, 0, 50], [0, 100.0, 40], [0, 0, 1]])
     there = PinholeView(K, (100, 80), rig.FORWARD)
     ramp = np.repeat(np.arange(100, dtype=np.uint8)[None, :, None], 80, 0).repeat(3, 2)
@@ -258,7 +258,7 @@ def test_a_pixel_is_looked_up_where_its_ray_points():
     assert np.abs(smaller[20, :, 0] - (2 * np.arange(50) + 0.5)).max() <= 0.5
 
 
-def test_the_compass_points_north_along_y_and_gravity_up():
+def test_imu_compass_is_zero_at_north_and_gravity_points_up():
     east = imu(road.observation(road.STRAIGHT, yaw=0.0, speed=5.0).ego)
     north = imu(road.observation(road.STRAIGHT, yaw=math.pi / 2, speed=5.0).ego)
 
@@ -267,10 +267,10 @@ def test_the_compass_points_north_along_y_and_gravity_up():
     assert east[2] == pytest.approx(9.81)
 
 
-def test_places_are_those_of_mercators_projection():
+def test_gnss_uses_the_mercator_projection():
     lat, lon = geographic(1000.0, 500.0, 42.0, 2.0)
 
-    # A degree of latitude is 111.3 km; of longitude that times the cosine.
+    # One degree of latitude is 111.3 km. For longitude, multiply by the cosine of the latitude.
     assert lat - 42 == pytest.approx(500 / 111_319.5, rel=1e-3)
     assert lon - 2 == pytest.approx(1000 / 111_319.5 / math.cos(math.radians(42)), rel=1e-6)
 
@@ -286,11 +286,11 @@ def test_places_are_those_of_mercators_projection():
         ({"throttle": 7.0}, 0.0, 3.85),
     ],
 )
-def test_throttle_and_brake_are_accelerations(control, speed, acceleration):
+def test_throttle_and_brake_are_converted_to_accelerations(control, speed, acceleration):
     assert command_of(VehicleControl(**control), speed).acceleration == pytest.approx(acceleration)
 
 
-def test_steering_is_to_the_right_and_less_at_speed():
+def test_positive_steering_is_right_and_decreases_with_speed():
     slow = command_of(VehicleControl(steer=0.5), 0.0)
     fast = command_of(VehicleControl(steer=0.5), 120 / 3.6)
 
@@ -298,12 +298,12 @@ def test_steering_is_to_the_right_and_less_at_speed():
     assert fast.steering == pytest.approx(0.7 * slow.steering)
 
 
-def test_reverse_is_the_gear():
+def test_reverse_sets_the_gear():
     assert command_of(VehicleControl(throttle=0.5, reverse=True), 0.0).gear == "reverse"
     assert command_of(VehicleControl(throttle=0.5), 0.0).gear == "drive"
 
 
 @pytest.mark.parametrize("answer", [None, VehicleControl(throttle=math.nan), {"throttle": 1.0}])
-def test_what_is_no_command_is_refused(answer):
+def test_an_invalid_control_is_refused(answer):
     with pytest.raises(PeerError, match="run_step answers"):
         command_of(answer, 0.0)

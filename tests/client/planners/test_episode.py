@@ -14,7 +14,7 @@ from ..fake_worker import FakeWorker
 
 
 @pytest.mark.network
-def test_an_episode_ends_where_the_road_does(worker: FakeWorker) -> None:
+def test_an_episode_ends_at_the_end_of_the_road(worker: FakeWorker) -> None:
     with (
         real2sim.connect(worker.url) as client,
         client.session(scene="street") as session,
@@ -39,7 +39,7 @@ def test_every_stage_of_every_step_is_timed(worker: FakeWorker) -> None:
 
 
 @pytest.mark.network
-def test_every_observation_is_shown_the_first_included(worker: FakeWorker) -> None:
+def test_the_callback_receives_every_observation_including_the_first(worker: FakeWorker) -> None:
     seen: list[int] = []
     with (
         real2sim.connect(worker.url) as client,
@@ -53,7 +53,7 @@ def test_every_observation_is_shown_the_first_included(worker: FakeWorker) -> No
 
 @pytest.mark.network
 @pytest.mark.parametrize("module", [real2sim, planners], ids=lambda m: m.__name__)
-def test_the_example_in_the_docstring_runs(
+def test_the_docstring_example_runs(
     worker: FakeWorker, module: object, capsys: pytest.CaptureFixture[str]
 ) -> None:
     example = textwrap.dedent(module.__doc__.split("::\n\n", 1)[1].rsplit("\n\n", 1)[0])
@@ -66,12 +66,12 @@ def test_the_example_in_the_docstring_runs(
     assert capsys.readouterr().out
 
 
-def test_percentiles_are_those_of_the_measurements():
+def test_stage_times_report_mean_and_percentiles():
     times = StageTimes.of([float(n) for n in range(101)])
     assert (times.count, times.mean, times.p50, times.p95, times.p99) == (101, 50, 50, 95, 99)
 
 
-def test_planners_are_found_by_name_and_in_the_working_folder(tmp_path, monkeypatch):
+def test_planners_are_loaded_by_name_and_from_the_working_folder(tmp_path, monkeypatch):
     (tmp_path / "my_planner.py").write_text(
         "class Mine:\n    def reset(self, obs): pass\n    def plan(self, obs): pass\n"
         "class Half:\n    def plan(self, obs): pass\n"
@@ -85,6 +85,6 @@ def test_planners_are_found_by_name_and_in_the_working_folder(tmp_path, monkeypa
 
 
 @pytest.mark.parametrize("name", ["nobody", "no.such.module:Class", "real2sim.planners:Nobody"])
-def test_planners_that_are_not_there_are_named(name):
+def test_unknown_planners_are_named_in_the_error(name):
     with pytest.raises(ValueError, match=f"planner {name!r}"):
         load_planner(name)

@@ -14,7 +14,7 @@ from .road import STRAIGHT, agent, observation
 
 
 def speeds(plan) -> np.ndarray:
-    """Mean speed between the poses of a plan, the vehicle's own first [m/s]."""
+    """Mean speed between consecutive poses of a plan, starting at the vehicle [m/s]."""
     points = np.array([(0.0, 0.0), *[pose[:2] for pose in plan.poses]])
     times = np.array([1_000_000, *plan.times_us]) * 1e-6
     return np.linalg.norm(np.diff(points, axis=0), axis=1) / np.diff(times)
@@ -25,7 +25,7 @@ def arc(radius: float, *, quarter: float = 1.0) -> np.ndarray:
     return np.stack([radius * np.sin(angles), radius * (1 - np.cos(angles))], axis=1)
 
 
-def test_a_straight_road_is_cruised_along_its_middle():
+def test_a_straight_road_is_driven_at_cruising_speed_along_the_centre():
     plan = FollowRoute(speed=8.0).plan(observation(STRAIGHT, speed=8.0))
     poses = np.array(plan.poses)
     np.testing.assert_allclose(poses[:, 1:], 0.0, atol=1e-9)
@@ -39,14 +39,14 @@ def test_plans_reach_three_seconds_ahead_in_the_vehicle_frame():
     assert plan.times_us[-1] == 4_000_000
 
 
-def test_from_standstill_it_accelerates_as_comfort_says():
+def test_acceleration_from_standstill_is_the_comfort_limit():
     plan = FollowRoute(speed=20.0).plan(observation(STRAIGHT))
     travelled = np.array(plan.poses)[:, 0]
     seconds = np.array(plan.times_us) * 1e-6 - 1.0
     np.testing.assert_allclose(travelled, 0.5 * Comfort().acceleration * seconds**2, rtol=0.02)
 
 
-def test_a_bend_is_taken_at_the_lateral_acceleration_allowed():
+def test_a_bend_is_driven_at_the_lateral_acceleration_limit():
     comfort = Comfort()
     path = Path.along(np.concatenate([arc(15.0), arc(15.0)[-1] + [[0.0, 20.0]]]))
     limits = speed_limits(path, cruise=20.0, comfort=comfort)
@@ -54,7 +54,7 @@ def test_a_bend_is_taken_at_the_lateral_acceleration_allowed():
     np.testing.assert_allclose(inside, math.sqrt(comfort.lateral * 15.0), rtol=0.05)
 
 
-def test_it_brakes_before_the_bend_and_not_in_it():
+def test_braking_happens_before_a_bend():
     bend = np.concatenate([STRAIGHT[:40], STRAIGHT[39] + arc(10.0)[1:]])
     path = Path.along(bend)
     limits = speed_limits(path, cruise=15.0, comfort=Comfort())
@@ -63,13 +63,13 @@ def test_it_brakes_before_the_bend_and_not_in_it():
     assert limits[path.arc < 5].min() > limits[(path.arc > 42) & (path.arc < 50)].max()
 
 
-def test_yaw_is_the_direction_driven_in_a_bend():
+def test_yaw_follows_the_path_in_a_bend():
     poses = np.array(FollowRoute(speed=5.0).plan(observation(arc(20.0), speed=5.0)).poses)
     angle = np.arctan2(poses[:, 0], 20.0 - poses[:, 1])
     np.testing.assert_allclose(poses[2:, 2], angle[2:], atol=0.03)
 
 
-def test_beside_the_route_it_comes_back_without_a_swerve():
+def test_a_lateral_offset_is_corrected_smoothly():
     route = STRAIGHT - [0.0, 2.0]
     plan = FollowRoute(speed=8.0, horizon=5.0).plan(observation(route, speed=8.0))
     poses = np.array(plan.poses)
@@ -78,25 +78,25 @@ def test_beside_the_route_it_comes_back_without_a_swerve():
     assert np.abs(poses[:, 2]).max() < 0.3
 
 
-def test_what_lies_behind_on_the_route_is_left_behind():
+def test_route_points_behind_the_vehicle_are_ignored():
     route = STRAIGHT - [30.0, 0.0]
     plan = FollowRoute().plan(observation(route, speed=5.0))
     assert plan.poses[0][0] > 0.0
 
 
-def test_at_the_end_of_the_route_it_stands():
+def test_the_plan_stops_at_the_end_of_the_route():
     plan = FollowRoute(horizon=10.0).plan(observation(STRAIGHT[:16], speed=6.0))
     assert 14.0 < plan.poses[-1][0] <= 15.0
     assert speeds(plan)[-1] < 0.3
 
 
 @pytest.mark.parametrize("route", [np.zeros((0, 2)), np.zeros((1, 2))])
-def test_without_a_route_it_stands(route):
+def test_without_a_route_the_vehicle_stands_still(route):
     plan = FollowRoute().plan(observation(route))
     np.testing.assert_allclose(np.array(plan.poses), 0.0, atol=1e-9)
 
 
-def test_it_stops_behind_one_that_stands():
+def test_the_plan_stops_behind_a_stationary_vehicle():
     plan = FollowRoute(horizon=12.0).plan(
         observation(STRAIGHT, speed=8.0, agents=(agent(30.0, 0.3),))
     )
@@ -106,7 +106,7 @@ def test_it_stops_behind_one_that_stands():
     assert rear - bumper == pytest.approx(Comfort().gap, abs=half_a_metre_of_path)
 
 
-def test_it_falls_in_behind_one_that_is_slower():
+def test_the_plan_slows_down_behind_a_slower_vehicle():
     plan = FollowRoute(speed=12.0, horizon=8.0).plan(
         observation(STRAIGHT * 3, speed=10.0, agents=(agent(20.0, 0.0, speed=4.0),))
     )
@@ -118,12 +118,12 @@ def test_it_falls_in_behind_one_that_is_slower():
     [agent(30.0, 3.5), agent(-15.0, 0.0), agent(30.0, -4.0, speed=5.0)],
     ids=["next lane", "behind", "parked lane"],
 )
-def test_who_is_not_in_the_way_does_not_matter(other):
+def test_agents_outside_the_corridor_are_ignored(other):
     free = FollowRoute().plan(observation(STRAIGHT, speed=8.0))
     assert FollowRoute().plan(observation(STRAIGHT, speed=8.0, agents=(other,))) == free
 
 
-def test_others_are_seen_where_they_are_whatever_the_vehicle_faces():
+def test_agent_positions_are_transformed_to_the_vehicle_frame():
     yaw, position = 2.0, (50.0, -20.0, 0.0)
     ahead = (position[0] + 20 * math.cos(yaw), position[1] + 20 * math.sin(yaw))
     turned = observation(
@@ -141,7 +141,7 @@ def test_others_are_seen_where_they_are_whatever_the_vehicle_faces():
     start=st.tuples(st.floats(-3, 3), st.floats(-3, 3)),
     speed=st.floats(0, 20),
 )
-def test_on_any_route_plans_are_drivable(steps, start, speed):
+def test_plans_are_finite_and_within_speed_limits_on_any_route(steps, start, speed):
     heading = np.cumsum([turn for _, turn in steps])
     lengths = np.array([length for length, _ in steps])
     moves = lengths[:, None] * np.stack([np.cos(heading), np.sin(heading)], axis=1)
@@ -152,7 +152,7 @@ def test_on_any_route_plans_are_drivable(steps, start, speed):
 
 
 @given(st.lists(st.floats(0, 30), min_size=2, max_size=40), st.floats(0.5, 9))
-def test_lowered_limits_are_the_highest_that_braking_allows(values, braking):
+def test_braking_limits_are_the_highest_reachable_speeds(values, braking):
     arc_lengths = np.arange(len(values), dtype=float)
     limits = np.array(values)
     lowered = brake_ahead(arc_lengths, limits, braking=braking)
@@ -162,6 +162,6 @@ def test_lowered_limits_are_the_highest_that_braking_allows(values, braking):
 
 
 @pytest.mark.parametrize("options", [{"speed": 0.0}, {"spacing": 0.0}, {"spacing": 4.0}])
-def test_settings_that_make_no_plan_are_refused(options):
+def test_invalid_speed_or_spacing_is_refused(options):
     with pytest.raises(ValueError, match="give a speed above 0"):
         FollowRoute(**options)

@@ -1,4 +1,4 @@
-"""A planner behind NeuroNCAP's interface, played by a small server on loopback."""
+"""The NeuroNCAP planner adapter against a small local server."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ AHEAD = [[3.0 * (k + 1), 0.5 * (k + 1)] for k in range(6)]
 
 
 class Peer(HTTPServer):
-    """Answers with ``reply``; keeps what it was asked."""
+    """Answers with ``reply``, and records all requests."""
 
     def __init__(self):
         super().__init__(("127.0.0.1", 0), Handler)
@@ -81,26 +81,26 @@ def planner(peer):
     planner.close()
 
 
-def test_it_is_found_by_name_and_wants_all_cameras(peer):
+def test_the_planner_is_found_by_name_and_needs_all_cameras(peer):
     planner = load_planner(f"neuroncap={peer.url}")
     assert needs_of(planner).all_cameras
     assert needs_of(planner).modalities == ("rgb",)
     planner.close()
 
 
-def test_the_way_comes_back_with_times_and_headings(planner):
+def test_the_trajectory_is_returned_with_times_and_headings(planner):
     plan = planner.plan(rig.seen())
     assert plan.times_us == [1_500_000 + 500_000 * k for k in range(6)]
     assert [pose[:2] for pose in plan.poses] == [tuple(p) for p in AHEAD]
     assert [pose[2] for pose in plan.poses] == pytest.approx([math.atan2(0.5, 3.0)] * 6)
 
 
-def test_standing_keeps_the_heading(peer, planner):
+def test_a_standing_trajectory_keeps_the_heading(peer, planner):
     peer.reply = {"trajectory": [[0.0, 0.0], [0.01, 0.005], [0.01, 0.005]], "aux_outputs": {}}
     assert [pose[2] for pose in planner.plan(rig.seen()).poses] == [0.0] * 3
 
 
-def test_it_is_told_what_neuroncap_tells(peer, planner):
+def test_requests_contain_the_neuroncap_inputs(peer, planner):
     planner.plan(rig.seen())
     (_, reset), (path, told) = peer.asked
     assert reset == {}
@@ -115,7 +115,7 @@ def test_it_is_told_what_neuroncap_tells(peer, planner):
 
 
 def form(value):
-    """Keys, lengths and kinds of a JSON value."""
+    """Keys, lengths and types of a JSON value."""
     if isinstance(value, dict):
         return {key: form(part) for key, part in value.items()}
     if isinstance(value, list):
@@ -123,8 +123,8 @@ def form(value):
     return "number" if isinstance(value, int | float) else type(value).__name__
 
 
-def test_what_it_is_told_has_the_form_that_neuroncap_itself_sends(peer, planner):
-    """By NeuroNCAP's own code, out of a checkout of atonderski/neuro-ncap (MIT)."""
+def test_requests_have_the_same_structure_as_neuroncaps_own(peer, planner):
+    """Compared with NeuroNCAP's own code, from a checkout of atonderski/neuro-ncap (MIT)."""
     checkout = os.environ.get("REAL2SIM_NEURONCAP")
     if not checkout:
         pytest.skip("REAL2SIM_NEURONCAP names no checkout of atonderski/neuro-ncap")
@@ -132,7 +132,7 @@ def test_what_it_is_told_has_the_form_that_neuroncap_itself_sends(peer, planner)
         pytest.importorskip(needed)
     planner.plan(rig.seen())
     told = peer.asked[-1][1]
-    # Its package imports nuScenes' toolkit and more, which this module does not use.
+    # Its package imports nuScenes' toolkit and other packages that this module does not use.
     for name in ("neuro_ncap", "neuro_ncap.components"):
         package = types.ModuleType(name)
         package.__path__ = [str(Path(checkout, *name.split(".")))]
@@ -162,7 +162,7 @@ def test_what_it_is_told_has_the_form_that_neuroncap_itself_sends(peer, planner)
     assert told["command"] == theirs.Command.STRAIGHT
 
 
-def test_cameras_get_the_names_that_the_planner_knows(peer, planner):
+def test_cameras_are_renamed_for_the_planner(peer, planner):
     planner.plan(rig.seen())
     told = peer.asked[-1][1]
     ours = {"CAM_FRONT": "front", "CAM_FRONT_LEFT": "left", "CAM_BACK": "CAM_BACK"}
@@ -189,18 +189,18 @@ def test_cameras_get_the_names_that_the_planner_knows(peer, planner):
         ({"trajectory": [["a", "b"]]}, "not a list of points"),
     ],
 )
-def test_answers_that_are_no_way_are_refused(peer, planner, reply, said):
+def test_invalid_trajectories_are_refused(peer, planner, reply, said):
     peer.reply = reply
     with pytest.raises(PeerError, match=said):
         planner.plan(rig.seen())
 
 
-def test_what_the_planner_complains_of_is_passed_on(peer, planner):
+def test_an_error_of_the_planner_is_passed_on(peer, planner):
     peer.status, peer.reply = 500, {"detail": "out of memory"}
     with pytest.raises(PeerError, match=r"/infer answers 500.*out of memory"):
         planner.plan(rig.seen())
 
 
-def test_nobody_there_is_said_by_address():
+def test_an_unreachable_planner_is_named_by_address():
     with pytest.raises(PeerError, match=r"no planner answers at http://127\.0\.0\.1:9"):
         NeuroNcap("http://127.0.0.1:9", timeout=0.3)

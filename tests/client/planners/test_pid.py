@@ -13,13 +13,13 @@ from .road import STRAIGHT, agent, observation
 LEFT, RIGHT = (np.add(STRAIGHT, [0.0, side]) for side in (1.0, -1.0))
 
 
-def test_a_pid_answers_the_error_its_sum_and_its_slope():
+def test_a_pid_adds_proportional_integral_and_derivative_terms():
     pid = Pid(Gains(2.0, 0.5, 0.1), low=-100, high=100)
     assert pid(3.0, 0.0) == pytest.approx(6.0)
     assert pid(4.0, 0.5) == pytest.approx(8.0 + 1.0 + 0.2)
 
 
-def test_the_integral_does_not_wind_up_while_the_output_is_cut():
+def test_the_integral_does_not_wind_up_while_the_output_saturates():
     pid = Pid(Gains(1.0, 1.0), low=-1.0, high=1.0)
     for _ in range(100):
         assert pid(50.0, 0.1) == 1.0
@@ -27,7 +27,7 @@ def test_the_integral_does_not_wind_up_while_the_output_is_cut():
 
 
 def drive(planner, *, aside: float, seconds: float = 15.0) -> list[tuple[float, float, float]]:
-    """(y, yaw, speed) of a kinematic bicycle that the planner drives along the x axis."""
+    """(y, yaw, speed) of a kinematic bicycle controlled by the planner along the x axis."""
     x, y, yaw, speed, dt = 0.0, aside, 0.0, 5.0, 0.1
     states = []
     for k in range(int(seconds / dt)):
@@ -43,24 +43,24 @@ def drive(planner, *, aside: float, seconds: float = 15.0) -> list[tuple[float, 
     return states
 
 
-def test_it_reaches_its_speed_and_the_route_and_stays_there():
+def test_speed_and_route_are_reached_and_held():
     last = drive(PidFollowRoute(speed=8.0), aside=1.0)[-20:]
     assert all(abs(y) < 0.05 and abs(yaw) < 0.01 for y, yaw, _ in last)
     assert all(speed == pytest.approx(8.0, abs=0.15) for _, _, speed in last)
 
 
-def test_it_steers_to_the_side_on_which_the_route_lies():
+def test_steering_is_towards_the_route():
     assert PidFollowRoute().plan(observation(LEFT, speed=5.0)).steering > 0.0
     assert PidFollowRoute().plan(observation(RIGHT, speed=5.0)).steering < 0.0
 
 
-def test_it_is_blind_for_what_stands_on_the_route():
+def test_agents_on_the_route_are_ignored():
     free = PidFollowRoute().plan(observation(STRAIGHT, speed=8.0))
     blocked = PidFollowRoute().plan(observation(STRAIGHT, speed=8.0, agents=[agent(8.0, 0.0)]))
     assert blocked == free
 
 
-def test_reset_forgets_the_last_episode():
+def test_reset_clears_the_state_of_the_last_episode():
     planner, obs = PidFollowRoute(), observation(LEFT, speed=5.0)
     first = planner.plan(obs)
     planner.plan(observation(STRAIGHT, speed=2.0, t_us=2_000_000))

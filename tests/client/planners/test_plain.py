@@ -1,4 +1,4 @@
-"""The planners' arrays give the plans of the same rules written out point by point."""
+"""The vectorized planners equal the reference implementation written point by point."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from . import plain
 from .road import agent, observation
 
 TOLERANCE = 1e-9
-"""Of positions and headings, [m] and [rad]: sums are taken in another order."""
+"""For positions [m] and headings [rad], because the order of summation differs."""
 DELAYS = delays_of_poses(speed=8.0, horizon=3.0, spacing=0.25)
 
 bends = st.floats(-0.08, 0.08)
@@ -33,7 +33,7 @@ agents = st.lists(
 
 @st.composite
 def scenes(draw):
-    """An observation anywhere in the world, near a route that bends."""
+    """An observation at a random pose near a curved route."""
     heading = np.cumsum(np.full(20, 2.0 * draw(bends)))
     steps = 2.0 * np.stack([np.cos(heading), np.sin(heading)], axis=1)
     start = [draw(st.floats(-3.0, 3.0)), draw(st.floats(-3.0, 3.0))]
@@ -48,28 +48,28 @@ def scenes(draw):
 
 @given(scenes())
 @settings(max_examples=40, deadline=None)
-def test_follow_route_plans_what_the_plain_rules_do(obs):
+def test_follow_route_matches_the_reference(obs):
     expected = plain.follow_route(obs, speed=8.0, delays=DELAYS)
     np.testing.assert_allclose(FollowRoute().plan(obs).poses, expected, rtol=0, atol=TOLERANCE)
 
 
 @given(scenes())
 @settings(max_examples=40, deadline=None)
-def test_idm_plans_what_the_plain_rules_do(obs):
+def test_idm_matches_the_reference(obs):
     expected = plain.idm(obs, speed=8.0, delays=DELAYS)
     np.testing.assert_allclose(Idm().plan(obs).poses, expected, rtol=0, atol=TOLERANCE)
 
 
 @given(scenes())
 @settings(max_examples=40, deadline=None)
-def test_speed_limits_are_those_of_the_plain_rules(obs):
+def test_speed_limits_match_the_reference(obs):
     arc, points = plain.path_of(obs.route)
     expected = plain.speed_limits(arc, points, 8.0, Comfort())
     found = speed_limits(Path.along(obs.route), cruise=8.0, comfort=Comfort())
     np.testing.assert_allclose(found, expected, rtol=0, atol=TOLERANCE)
 
 
-def test_a_route_of_one_point_or_none_lets_all_of_them_stand():
+def test_planners_stand_still_on_a_route_with_fewer_than_two_points():
     for route in (np.zeros((0, 2)), np.array([[3.0, 1.0]])):
         obs = observation(route, agents=[agent(5.0, 0.0)])
         np.testing.assert_allclose(

@@ -1,4 +1,4 @@
-"""The ROS 2 bridge without ROS: messages by their definitions, the loop by a node played here."""
+"""The ROS 2 bridge without ROS: messages by their definitions, and the loop with a fake node."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ SIXTH = (math.cos(math.pi / 6), 0.0, 0.0, math.sin(math.pi / 6))
 
 
 def on_the_wire(message: Any, name: str) -> Any:
-    """Serialised by the message definitions of ROS and back."""
+    """Serialize by the ROS message definitions, and read back."""
     return STORE.deserialize_cdr(STORE.serialize_cdr(message, name), name)
 
 
@@ -66,7 +66,7 @@ def frame(modality: str, image: np.ndarray) -> Frame:
 # --- messages -------------------------------------------------------------------------------------
 
 
-def test_the_clock_is_simulation_time_also_below_zero():
+def test_the_clock_is_simulation_time_even_below_zero():
     stamp = on_the_wire(BUILD.clock(2_345_678), "rosgraph_msgs/msg/Clock").clock
     before = on_the_wire(BUILD.clock(-1), "rosgraph_msgs/msg/Clock").clock
 
@@ -74,7 +74,7 @@ def test_the_clock_is_simulation_time_also_below_zero():
     assert (before.sec, before.nanosec) == (-1, 999_999_000)
 
 
-def test_odometry_is_the_pose_in_the_map_and_the_velocity_of_the_vehicle():
+def test_odometry_has_the_map_pose_and_the_vehicle_velocity():
     found = on_the_wire(BUILD.odometry(seen()), "nav_msgs/msg/Odometry")
 
     assert (found.header.frame_id, found.child_frame_id) == ("map", "base_link")
@@ -84,7 +84,7 @@ def test_odometry_is_the_pose_in_the_map_and_the_velocity_of_the_vehicle():
     assert (found.twist.twist.linear.x, found.twist.twist.angular.z) == (4.0, 0.2)
 
 
-def test_transforms_lead_from_the_map_to_the_cameras():
+def test_transforms_connect_map_vehicle_and_cameras():
     (vehicle,) = on_the_wire(BUILD.ego_transform(seen()), "tf2_msgs/msg/TFMessage").transforms
     T = [[0, 0, 1, 1.5], [-1, 0, 0, 0.2], [0, -1, 0, 1.4], [0, 0, 0, 1]]
     camera = CameraInfo(name="front", width=48, height=32, K=K.tolist(), T_vehicle_camera=T)
@@ -95,7 +95,7 @@ def test_transforms_lead_from_the_map_to_the_cameras():
     assert (front.header.frame_id, front.child_frame_id) == ("base_link", "front_optical")
     assert front.transform.translation.x == 1.5
     q = front.transform.rotation
-    # The optical axis, z, is the vehicle's x.
+    # The optical axis z is the vehicle's x axis.
     assert 2 * (q.x * q.z + q.w * q.y) == pytest.approx(1.0)
 
 
@@ -103,7 +103,7 @@ def test_transforms_lead_from_the_map_to_the_cameras():
     ("modality", "dtype", "channels", "encoding"),
     [("rgb", np.uint8, 3, "rgb8"), ("depth", "<f4", 0, "32FC1"), ("instance", "<u2", 0, "16UC1")],
 )
-def test_images_keep_their_bytes(modality, dtype, channels, encoding):
+def test_images_keep_their_bytes_and_encoding(modality, dtype, channels, encoding):
     shape = (32, 48, channels) if channels else (32, 48)
     image = np.arange(np.prod(shape)).reshape(shape).astype(dtype)
     found = on_the_wire(BUILD.image(frame(modality, image)), "sensor_msgs/msg/Image")
@@ -114,7 +114,7 @@ def test_images_keep_their_bytes(modality, dtype, channels, encoding):
     assert found.header.frame_id == "front_optical"
 
 
-def test_camera_infos_are_pinholes():
+def test_camera_infos_have_pinhole_intrinsics():
     image = frame("rgb", np.zeros((32, 48, 3), np.uint8))
     found = on_the_wire(BUILD.camera_info(image), "sensor_msgs/msg/CameraInfo")
 
@@ -144,7 +144,7 @@ def ackermann(speed: float, angle: float = 0.1, acceleration: float = 0.0) -> Si
         (ackermann(-1.0).drive, 2.0, "reverse", 4.0),
     ],
 )
-def test_a_wanted_speed_is_approached_in_its_gear(message, speed, gear, acceleration):
+def test_a_target_speed_sets_gear_and_acceleration(message, speed, gear, acceleration):
     command = of_ackermann(message, seen(speed=speed))
 
     assert command.gear == gear
@@ -152,7 +152,7 @@ def test_a_wanted_speed_is_approached_in_its_gear(message, speed, gear, accelera
     assert command.steering == 0.1
 
 
-def test_a_turn_rate_is_an_angle_of_the_wheels():
+def test_a_turn_rate_is_converted_to_a_steering_angle():
     message = STORE.types["geometry_msgs/msg/Twist"](
         linear=STORE.types["geometry_msgs/msg/Vector3"](x=5.0, y=0.0, z=0.0),
         angular=STORE.types["geometry_msgs/msg/Vector3"](x=0.0, y=0.0, z=0.5),
@@ -174,7 +174,7 @@ def path(frame_id: str, *rows: tuple[int, float, float]) -> SimpleNamespace:
 
 
 @pytest.mark.parametrize(("frame_id", "ours"), [("map", "world"), ("base_link", "vehicle")])
-def test_a_path_is_a_trajectory(frame_id, ours):
+def test_a_path_is_converted_to_a_trajectory(frame_id, ours):
     message = path(frame_id, (1_000_000, 0.0, 0.0), (3_000_000, 1.0, 2.0), (3_500_000, 2.0, 2.0))
     plan = of_path(message, seen())
 
@@ -190,12 +190,12 @@ def test_a_path_is_a_trajectory(frame_id, ours):
         (path("map", (3_000_000, 0.0, 0.0), (3_000_000, 1.0, 0.0)), "increase"),
     ],
 )
-def test_a_path_that_is_no_plan_is_refused(message, sentence):
+def test_an_invalid_path_is_refused(message, sentence):
     with pytest.raises(CommandError, match=sentence):
         of_path(message, seen())
 
 
-def test_numbers_that_are_not_finite_are_refused():
+def test_non_finite_numbers_are_refused():
     with pytest.raises(CommandError, match="nan"):
         of_ackermann(ackermann(math.nan), seen())
 
@@ -204,7 +204,7 @@ def test_numbers_that_are_not_finite_are_refused():
 
 
 class PlayedNode:
-    """Answers every clock with what ``answer`` gives for it, in the next spin."""
+    """On each clock message, sends the result of ``answer`` in the next spin."""
 
     types = TYPES
 
@@ -231,7 +231,7 @@ class PlayedNode:
 
 
 class PlayedSession:
-    """Counts steps; over after ``last``."""
+    """Counts steps. The episode is over after ``last``."""
 
     def __init__(self, last: int = 4) -> None:
         self.welcome = SimpleNamespace(cameras=[])
@@ -254,12 +254,12 @@ class PlayedSession:
         return obs
 
 
-def test_in_lock_step_each_observation_gets_a_command():
+def test_in_lock_step_each_observation_waits_for_a_command():
     session, node = PlayedSession(), PlayedNode(lambda k: ackermann(float(k)))
     Ros2Bridge(session, node).run(sensors=["front"], seed=3)
 
     assert session.options == {"sensors": ["front"], "action": "control", "seed": 3}
-    # At 4 m/s, towards 1 to 4 m/s.
+    # At 4 m/s, with target speeds of 1 to 4 m/s.
     expected = [-8.0, -2 / 0.3, -1 / 0.3, 0.0]
     assert [plan.acceleration for plan in session.plans] == pytest.approx(expected)
     topics = [topic for topic, _ in node.sent]
@@ -268,7 +268,7 @@ def test_in_lock_step_each_observation_gets_a_command():
     assert topics[1:] == each * 5
 
 
-def test_in_real_time_the_newest_command_holds_and_none_is_a_stop():
+def test_in_real_time_the_latest_command_is_kept_and_the_default_is_to_stop():
     session = PlayedSession()
     node = PlayedNode(lambda k: ackermann(9.0) if k == 3 else None, spins=10_000)
     Ros2Bridge(session, node, real_time=1.0).run()
@@ -277,14 +277,14 @@ def test_in_real_time_the_newest_command_holds_and_none_is_a_stop():
     assert [plan.acceleration for plan in session.plans[2:]] == [4.0, 4.0]
 
 
-def test_commands_are_heard_by_a_simulation_that_cannot_keep_up_with_real_time():
+def test_commands_are_received_even_if_the_simulation_is_slower_than_real_time():
     session, node = PlayedSession(), PlayedNode(lambda _k: ackermann(9.0), spins=10_000)
     Ros2Bridge(session, node, real_time=1e9).run()
 
     assert [plan.acceleration for plan in session.plans] == [4.0] * 4
 
 
-def test_a_command_that_is_none_is_reported_and_the_next_one_awaited():
+def test_an_invalid_command_is_reported_and_the_next_one_awaited():
     said: list[str] = []
     session, node = PlayedSession(last=1), PlayedNode(lambda _k: path("odom"), spins=3)
     Ros2Bridge(session, node, commands="path", report=said.append).run()
@@ -294,7 +294,7 @@ def test_a_command_that_is_none_is_reported_and_the_next_one_awaited():
     assert said == ["/plan: a path in frame 'odom'"]
 
 
-def test_without_ros_it_says_what_to_install(monkeypatch):
+def test_without_ros_the_error_says_what_to_install(monkeypatch):
     imported = builtins.__import__
 
     def without(name: str, *rest: Any) -> Any:
@@ -312,7 +312,7 @@ def test_without_ros_it_says_what_to_install(monkeypatch):
 
 
 class PlayedRos:
-    """``rclpy`` and message packages, as far as the node uses them."""
+    """The parts of ``rclpy`` and the message packages that the node uses."""
 
     def __init__(self) -> None:
         self.sent: list[tuple[str, Any]] = []
@@ -361,7 +361,7 @@ def ros(monkeypatch) -> PlayedRos:
     message_class.cache_clear()
 
 
-def test_the_node_publishes_by_ros_and_keeps_what_stands_still(ros):
+def test_the_node_publishes_and_latches_static_transforms(ros):
     node = RosNode()
     builder = MessageBuilder(node.types)
     cameras = builder.camera_transforms(0, [])
@@ -374,13 +374,13 @@ def test_the_node_publishes_by_ros_and_keeps_what_stands_still(ros):
     assert [topic for topic, _ in ros.sent] == ["/tf_static", *["/camera/front/image_raw"] * 2]
     assert ros.profiles["/tf_static"] == {"depth": 1, "durability": "kept"}
     assert ros.profiles["/camera/front/image_raw"]["durability"] == "gone"
-    # What rclpy takes without looking at every number.
+    # rclpy accepts an array without checking every element.
     assert isinstance(image.data, array.array)
     assert image.data.tobytes() == b"\x01" * (32 * 48 * 3)
     assert ros.ended == ["node", "rclpy"]
 
 
-def test_the_node_receives_until_ros_ends(ros):
+def test_the_node_receives_until_ros_shuts_down(ros):
     node, found = RosNode(), []
     node.subscribe("/cmd_vel", "geometry_msgs/msg/Twist", found.append)
     ros.receive["/cmd_vel"]("go")

@@ -1,4 +1,4 @@
-"""The detector bench: its average precision, its network, and truth of edited streets."""
+"""The detector bench: average precision, network, and ground truth of edited streets."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from real2sim_bench.detector_streets import EditedStreets, boxes_in
 
 
 def scene_of_boxes(seed: int = 0, images: int = 6):
-    """Objects, and what a middling detector would find of them."""
+    """Objects, and detections of a mediocre detector."""
     rng = np.random.default_rng(seed)
     truth, found = [], []
     for _ in range(images):
@@ -38,7 +38,7 @@ def scene_of_boxes(seed: int = 0, images: int = 6):
     return found, truth
 
 
-def test_average_precision_is_that_of_pycocotools():
+def test_average_precision_matches_pycocotools():
     coco, evaluation = (pytest.importorskip(f"pycocotools.{name}") for name in ("coco", "cocoeval"))
     found, truth = scene_of_boxes()
     notes, results = [], []
@@ -69,7 +69,7 @@ def test_average_precision_is_that_of_pycocotools():
         }
         data.createIndex()
         judge = evaluation.COCOeval(data, data.loadRes(results), "bbox")
-        # The published code drops a given "ignore" before it looks at it.
+        # The published code discards a given "ignore" before using it.
         judge._prepare = _keep_ignored(judge, judge._prepare, {n["id"]: n["ignore"] for n in notes})
         judge.evaluate()
         judge.accumulate()
@@ -89,13 +89,13 @@ def _keep_ignored(judge, prepare, ignore):
     return prepared
 
 
-def test_what_is_fed_as_found_is_all_right():
+def test_perfect_detections_have_an_average_precision_of_1():
     _, truth = scene_of_boxes()
     found = [(one.boxes, np.ones(len(one.boxes))) for one in truth]
     assert average_precision(found, truth) == {"ap": 1.0, "ap50": 1.0, "ap75": 1.0}
 
 
-def test_the_smaller_of_two_objects_is_learned_where_both_are():
+def test_the_smaller_of_two_overlapping_objects_is_the_target():
     boxes = np.array([[0.0, 0.0, 64.0, 64.0], [24.0, 24.0, 40.0, 40.0]])
     found, target = _targets(boxes, 8, 8)
     middle = 32 // STRIDE
@@ -104,7 +104,7 @@ def test_the_smaller_of_two_objects_is_learned_where_both_are():
 
 
 def pictures(count: int) -> TrainingImages:
-    """One bright square each, on noise."""
+    """Images with one bright square each, on noise."""
     rng = np.random.default_rng(0)
     images = rng.integers(0, 60, (count, 48, 64, 3), dtype=np.uint8)
     boxes = []
@@ -116,7 +116,7 @@ def pictures(count: int) -> TrainingImages:
 
 
 @pytest.mark.slow
-def test_squares_are_learned_and_found():
+def test_a_detector_learns_to_find_squares():
     shown = pictures(24)
     truth = [TrueBoxes(boxes, np.ones(1, np.bool_)) for boxes in shown.boxes]
     model = train_detector(shown, epochs=20, seed=0)
@@ -129,7 +129,7 @@ def test_the_same_seed_gives_the_same_weights():
     assert all(torch.equal(a, b) for a, b in weights)
 
 
-def test_boxes_of_an_instance_image_are_those_of_its_objects():
+def test_boxes_of_an_instance_image_enclose_its_objects():
     instance = np.zeros((80, 120), np.uint16)
     instance[20:40, 10:51], instance[60:66, 80:86] = 1, 2
     found = boxes_in(instance)
@@ -144,7 +144,7 @@ def test_edited_streets_are_the_same_for_the_same_seed(tiny_scene):
 
 
 @pytest.mark.slow
-def test_exported_frames_teach_a_detector_nearly_as_much_as_truth():
+def test_a_detector_trained_on_exported_frames_is_nearly_as_good_as_on_ground_truth():
     options = detector.DetectorBenchOptions(frames=400, epochs=16, drives=2, period_us=200_000)
     figures = detector.run(options)
     assert figures["ratio of ap50"] >= 0.95

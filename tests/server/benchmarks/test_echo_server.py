@@ -1,4 +1,4 @@
-"""The server that the bench of sessions is compared with."""
+"""The echo server, the baseline of the session bench."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ OBSERVATION = {"v": 1, "type": "obs", "id": 2, "step": 0, "t_us": 5}
 
 
 @pytest.mark.parametrize("what", ECHOED)
-def test_every_action_is_answered_by_the_observation(what: str) -> None:
+def test_every_action_is_answered_with_the_observation(what: str) -> None:
     client = TestClient(echo_app(encode(OBSERVATION)))
     with client.websocket_connect(f"/{what}", subprotocols=[DRIVE_SUBPROTOCOL]) as socket:
         socket.send_bytes(encode({"v": 1, "type": "hello", "id": 1}))

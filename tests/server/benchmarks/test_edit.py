@@ -10,7 +10,7 @@ pytestmark = pytest.mark.network
 
 
 @pytest.mark.slow
-def test_a_short_run_finds_all_edits_again_after_kills(capsys):
+def test_a_short_run_reports_all_edits_and_openings(capsys):
     figures = edit.run(edit.EditBenchOptions(operations=40, gaussians=20_000))
 
     assert json.loads(json.dumps(figures)) == figures
@@ -19,7 +19,7 @@ def test_a_short_run_finds_all_edits_again_after_kills(capsys):
     assert "append" in capsys.readouterr().out
 
 
-def test_edits_are_as_many_as_asked_and_the_same_each_time():
+def test_edits_have_the_requested_count_and_are_deterministic():
     first, again = (edit._edits(["a", "b"], 333) for _ in range(2))
 
     assert len(first) == 333

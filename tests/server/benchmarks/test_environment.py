@@ -1,4 +1,4 @@
-"""Every bench says what it was measured with."""
+"""Every bench records its environment."""
 
 import importlib
 import json
@@ -35,7 +35,7 @@ MODULES = {name: importlib.import_module(f"{real2sim_bench.__name__}.{name}") fo
 FIGURES = {"failures": [], "grows": False, "stage_ms": {}}
 
 
-def test_versions_are_those_of_the_libraries_in_use():
+def test_versions_match_the_installed_libraries():
     found = bench.environment()
     assert found["python"] == platform.python_version()
     assert found["numpy"] == np.__version__
@@ -45,12 +45,12 @@ def test_versions_are_those_of_the_libraries_in_use():
     assert found["cpu_threads"] >= 1
 
 
-def test_a_library_that_is_absent_is_named(monkeypatch):
+def test_a_missing_library_is_reported(monkeypatch):
     monkeypatch.setattr(bench, "LIBRARIES", ("no-such-library",))
     assert bench.environment()["no-such-library"] == "not installed"
 
 
-def test_every_bench_is_known_here():
+def test_every_bench_is_tested():
     folder = Path(real2sim_bench.__file__).parent
     named = {info.name for info in bench.app.registered_commands}
     assert named == set(MODULES)
@@ -59,7 +59,7 @@ def test_every_bench_is_known_here():
 
 
 @pytest.mark.parametrize("name", sorted(MODULES))
-def test_every_bench_writes_and_prints_what_it_was_measured_with(name, tmp_path, monkeypatch):
+def test_every_bench_writes_and_prints_its_environment(name, tmp_path, monkeypatch):
     monkeypatch.setattr(MODULES[name], "run", lambda *args, **options: {**FIGURES, "figure": 1})
     monkeypatch.setattr(physics, "as_rows", lambda figures: {})
     path = tmp_path / "figures.json"

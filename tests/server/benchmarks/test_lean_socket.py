@@ -1,4 +1,4 @@
-"""The bench's own client, against the library's server."""
+"""The bench's own WebSocket client against the library's server."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def echo(connection: ServerConnection) -> None:
 
 
 @pytest.mark.parametrize("size", [0, 1, 125, 126, 65_535, 65_536, 1_500_000])
-def test_messages_of_any_length_come_back_as_they_were(size):
+def test_messages_of_any_length_are_echoed_unchanged(size):
     message = os.urandom(size)
     with server(echo) as url, LeanSocket(url, subprotocol=SUBPROTOCOL) as lean:
         for _ in range(2):
@@ -44,7 +44,7 @@ def test_messages_of_any_length_come_back_as_they_were(size):
             assert bytes(lean.recv(LIMIT_S)) == message
 
 
-def test_messages_that_arrive_together_are_told_apart():
+def test_messages_received_together_are_separated():
     sent = [os.urandom(n) for n in (10, 70_000, 3, 200)]
 
     def talk(connection: ServerConnection) -> None:
@@ -59,7 +59,7 @@ def test_messages_that_arrive_together_are_told_apart():
         lean.send(b"done")
 
 
-def test_a_message_in_pieces_is_put_together():
+def test_a_fragmented_message_is_reassembled():
     def talk(connection: ServerConnection) -> None:
         connection.send(iter([b"one ", b"two ", b"three"]))
         connection.recv()
@@ -85,12 +85,12 @@ def test_a_ping_of_the_server_is_answered_before_the_next_message():
         lean.send(b"done")
 
 
-def test_its_own_ping_is_answered():
+def test_a_ping_of_the_client_is_answered():
     with server(echo) as url, LeanSocket(url, subprotocol=SUBPROTOCOL) as lean:
         assert lean.ping(LIMIT_S) > 0
 
 
-def test_a_server_that_says_nothing_is_given_up_and_heard_when_it_speaks_again():
+def test_receiving_works_after_a_timeout():
     with server(echo) as url, LeanSocket(url, subprotocol=SUBPROTOCOL) as lean:
         with pytest.raises(TimeoutError):
             lean.recv(0.05)
@@ -98,8 +98,8 @@ def test_a_server_that_says_nothing_is_given_up_and_heard_when_it_speaks_again()
         assert bytes(lean.recv(LIMIT_S)) == b"late"
 
 
-def test_a_message_that_has_begun_is_waited_for():
-    """As long as a message may stall, and not as long as one may take to come."""
+def test_a_started_message_uses_the_stall_timeout():
+    """The timeout of ``recv`` only applies to the start of a message."""
     waits_longer = threading.Event()
 
     def talk(connection: ServerConnection) -> None:
@@ -124,7 +124,7 @@ def test_a_message_that_has_begun_is_waited_for():
         lean.send(b"done")
 
 
-def test_a_server_that_stops_within_a_message_is_given_up(monkeypatch):
+def test_a_server_that_stalls_within_a_message_raises(monkeypatch):
     monkeypatch.setattr(drive_probe, "STALLED_S", 0.05)
     go_on = threading.Event()
 
@@ -143,7 +143,7 @@ def test_a_server_that_stops_within_a_message_is_given_up(monkeypatch):
         go_on.set()
 
 
-def test_a_server_that_closes_is_said_to_have_closed():
+def test_a_closed_connection_raises_with_the_reason():
     with (
         server(lambda connection: connection.close(1000, "enough")) as url,
         LeanSocket(url, subprotocol=SUBPROTOCOL) as lean,
@@ -152,6 +152,6 @@ def test_a_server_that_closes_is_said_to_have_closed():
         lean.recv(LIMIT_S)
 
 
-def test_another_protocol_is_refused_at_the_handshake():
+def test_another_subprotocol_is_refused_at_the_handshake():
     with server(echo, speaks="other.v1") as url, pytest.raises(InvalidHandshake):
         LeanSocket(url, subprotocol=SUBPROTOCOL)

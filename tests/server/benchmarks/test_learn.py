@@ -1,4 +1,4 @@
-"""The learn bench on almost nothing: every figure is there and makes sense."""
+"""The learn bench on a minimal workload."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ OPTIONS = learn.LearnBenchOptions(
 
 
 @pytest.mark.parametrize("part", ["small_images", "batched_worlds", "vector_environment"])
-def test_figures_of_the_process_are_positive(part: str) -> None:
+def test_single_process_figures_are_positive(part: str) -> None:
     figures = learn.PARTS[part](read_packed(SHIPPED), OPTIONS)
     flat = [v for value in figures.values() for v in _values(value)]
     assert flat
     assert all(v > 0 for v in flat)
 
 
-def test_small_images_are_nearer_to_a_large_one_scaled_down() -> None:
+def test_small_image_mode_does_not_lose_quality() -> None:
     figures = learn.small_images(read_packed(SHIPPED), OPTIONS)
     assert figures["psnr_db"] > figures["full_psnr_db"] - 1.5
     assert figures["worst_gain_db"] > -1.5
 
 
 @pytest.mark.network
-def test_sessions_are_driven_over_sockets() -> None:
+def test_sessions_over_sockets_are_measured() -> None:
     figures = learn.sessions_over_sockets(read_packed(SHIPPED), OPTIONS)
     assert figures["steps_per_s"] > 0
     assert figures["sessions"] == 2
@@ -38,7 +38,7 @@ def test_sessions_are_driven_over_sockets() -> None:
 
 @pytest.mark.slow
 @pytest.mark.network
-def test_sessions_are_driven_on_two_workers_at_once() -> None:
+def test_sessions_on_two_workers_are_measured() -> None:
     options = replace(OPTIONS, echo=True)
     figures = learn.sessions_of_two_workers(read_packed(SHIPPED), options)
     assert figures["steps_per_s"] > 0

@@ -1,4 +1,4 @@
-"""What ``bench physics`` prints."""
+"""Output of ``bench physics``."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def figures():
     }
 
 
-def test_every_situation_has_a_row_beside_what_is_wanted_of_it():
+def test_every_situation_is_printed_with_its_target():
     rows = physics.as_rows(figures())
     assert rows["vehicle structure, 97,336 particles"].startswith("8.20 M/s")
     assert rows["two cars at 15 m/s, 2 s"] == "4 s, 6 s of processors; 8 s wanted"
@@ -43,7 +43,7 @@ def test_every_situation_has_a_row_beside_what_is_wanted_of_it():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", physics.SITUATIONS)
-def test_situations_run_and_say_what_they_took(name):
+def test_measured_situations_report_their_cost(name):
     line = physics.measure(name)
     assert line["particles"] > 3000
     assert line["processor_s"] > 0

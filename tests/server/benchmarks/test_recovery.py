@@ -1,4 +1,4 @@
-"""The recovery bench: starts, ends, and that as many frames are on both sides."""
+"""The recovery bench: start poses, success criterion, and equal numbers of training frames."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ OPTIONS = recovery.RecoveryBenchOptions(
 
 
 class Straight:
-    """Goes on as it was turned."""
+    """Continues straight in its initial direction."""
 
     def reset(self, obs) -> None:
-        """Nothing is remembered."""
+        """Has no state."""
 
     def plan(self, obs) -> TrajectoryPlan:
         delays = np.arange(1, 7) * 0.5
@@ -31,12 +31,12 @@ class Straight:
         return TrajectoryPlan(times_us=times, poses=poses)
 
 
-def test_who_is_told_the_route_comes_back(tiny_scene):
+def test_a_planner_that_follows_the_route_recovers(tiny_scene):
     ends = recovery.drive_all(tiny_scene, [FollowRoute(speed=5.0) for _ in range(4)], OPTIONS)
     assert [end.success for end in ends] == [True] * 4
 
 
-def test_who_goes_straight_on_does_not(tiny_scene):
+def test_a_planner_that_drives_straight_does_not_recover(tiny_scene):
     options = recovery.RecoveryBenchOptions(
         seconds=1.0, plan_s=0.0, lateral=2.0, heading=0.01, seed=1
     )
@@ -45,18 +45,18 @@ def test_who_goes_straight_on_does_not(tiny_scene):
     assert min(abs(end.offset) for end in ends) > recovery.OFFSET_M
 
 
-def test_starts_are_the_same_for_every_planner(tiny_scene):
+def test_results_are_deterministic(tiny_scene):
     one, two = (recovery.drive_all(tiny_scene, [Straight(), Straight()], OPTIONS) for _ in range(2))
     assert one == two
 
 
-def test_starts_are_far_from_the_path_and_turned(tiny_scene):
+def test_starts_are_displaced_and_turned_within_limits(tiny_scene):
     worlds = recovery.displaced_worlds(tiny_scene, 3, OPTIONS)
     assert all(0.15 <= abs(world.sampled["start.lateral"]) <= 0.2 for world in worlds)
     assert all(0.015 <= abs(world.sampled["start.heading"]) <= 0.02 for world in worlds)
 
 
-def test_both_are_taught_as_many_frames(tiny_scene):
+def test_both_data_sets_have_the_same_number_of_frames(tiny_scene):
     plans = recovery._plans(PolicyShape(camera="front"), OPTIONS)
     drive = ScenarioDrive(tiny_scene, ScenarioState.of(tiny_scene))
     frames = {
@@ -67,7 +67,7 @@ def test_both_are_taught_as_many_frames(tiny_scene):
 
 
 @pytest.mark.slow
-def test_recovery_data_lifts_the_success_of_displaced_starts():
+def test_recovery_data_increases_the_success_from_displaced_starts():
     figures = recovery.run()
     assert figures["gain"] >= 0.15
     assert figures["given the route"]["success"] > 0.9

@@ -1,4 +1,4 @@
-"""The benchmark measures real pictures."""
+"""The render bench measures real images."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from real2sim_server.render import rasterize
 from real2sim_server.synthetic.gaussian_street import street_scene
 
 
-def test_street_has_the_count_asked_for_and_is_the_same_each_time() -> None:
+def test_the_street_has_the_requested_count_and_is_deterministic() -> None:
     first, second = street_scene(120_000), street_scene(120_000)
     assert first.gaussian_count == 120_000
     assert np.array_equal(first.instances[0].cloud.means, second.instances[0].cloud.means)
 
 
-def test_street_fills_the_picture_with_road_cars_and_sky() -> None:
+def test_the_street_image_shows_road_cars_and_sky() -> None:
     street = street_scene(120_000, width=96, height=64)
     camera = street.camera
     out = rasterize(
@@ -37,7 +37,7 @@ def test_street_fills_the_picture_with_road_cars_and_sky() -> None:
     assert len(out.instance.int().unique()) > 6
 
 
-def test_report_is_printed_and_returned_as_plain_values(
+def test_the_report_is_printed_and_json_serializable(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(bench, "REDUCED_GAUSSIANS", 300)
@@ -54,7 +54,7 @@ def test_report_is_printed_and_returned_as_plain_values(
     assert "street" in capsys.readouterr().out
 
 
-def test_splat_case_stands_before_the_asset(test_data: Path) -> None:
+def test_the_splat_case_has_the_asset_in_view(test_data: Path) -> None:
     case = bench.splat_case(test_data / "splats" / "biker.compressed.ply")
     assert (case.width, case.height, case.gaussian_count) == (1920, 1280, 152_746)
     small = case.reduced()

@@ -1,4 +1,4 @@
-"""The serve bench measures a worker of its own and says what it found."""
+"""The serve bench measures a worker that it starts, and prints the results."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ from real2sim_bench.serve import _quantile_bound
 pytestmark = pytest.mark.network
 
 
-def test_percentiles_are_those_of_the_values():
+def test_percentiles_of_values():
     figures = serve.percentiles([float(v) for v in range(101)])
     assert figures == {"count": 101, "min": 0, "p50": 50, "p95": 95, "p99": 99, "max": 100}
 
 
-def test_a_quantile_of_a_histogram_is_known_up_to_its_bucket():
+def test_a_histogram_quantile_is_the_upper_bound_of_its_bucket():
     buckets = {"0.001": 90.0, "0.005": 98.0, "0.01": 100.0, "+Inf": 100.0}
     assert _quantile_bound(buckets, 0.9) == 1.0
     assert _quantile_bound(buckets, 0.99) == 10.0
     assert _quantile_bound({}, 0.99) is None
 
 
-def test_a_program_that_is_stopped_notes_the_pause(monkeypatch):
+def test_pauses_of_a_process_are_recorded(monkeypatch):
     readings = iter([0.0, 0.0005, 0.0105, 0.0110, 0.0260, 1.0])
     monkeypatch.setattr(serve.time, "perf_counter", lambda: next(readings))
     assert serve._read_the_clock(0.02) == pytest.approx([0.01, 0.015])
 
 
-def test_pauses_are_those_of_all_cores():
+def test_pauses_are_summarized_over_all_cores():
     figures = serve.pauses(0.05)
     assert figures["cores"] >= 1
     assert figures["longest_ms"] == 0 or figures["longest_ms"] > 1
@@ -38,7 +38,7 @@ def test_pauses_are_those_of_all_cores():
 
 
 @pytest.mark.slow
-def test_a_short_run_gives_all_figures_as_json(capsys):
+def test_a_short_run_reports_all_figures_as_json(capsys):
     options = serve.ServeBenchOptions(
         gaussians=100_000,
         steps=50,

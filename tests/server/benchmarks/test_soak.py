@@ -1,4 +1,4 @@
-"""The soak finds every kind of planner answered as the protocol says, and memory that grows."""
+"""The soak bench: correct answers for every kind of planner, and memory growth."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from real2sim_bench.soak import BEHAVIOURS
 pytestmark = pytest.mark.network
 
 
-def test_every_way_to_misbehave_is_among_16_sessions_and_half_are_proper():
+def test_16_sessions_include_every_misbehaviour_and_half_behave_properly():
     behaviours = soak.behaviours(16)
     assert set(behaviours) == set(BEHAVIOURS)
     assert behaviours.count("proper") == 8
 
 
-def test_memory_is_judged_from_after_warming_up():
+def test_memory_growth_is_measured_after_warm_up():
     memory = soak.Memory([0, 1, 2, 3, 4, 5], [10, 300, 400, 400, 400, 460])
     figures = memory.figures(2.0)
     assert (figures["start_mb"], figures["warm_mb"], figures["end_mb"]) == (10, 400, 460)

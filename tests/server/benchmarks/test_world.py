@@ -9,7 +9,7 @@ from real2sim_server.scene.io import read_packed
 
 
 @pytest.mark.slow
-def test_a_run_measures_every_case_compiled_and_not(capsys):
+def test_a_run_measures_every_case_compiled_and_uncompiled(capsys):
     figures = world.run()
 
     assert json.loads(json.dumps(figures)) == figures
@@ -18,7 +18,7 @@ def test_a_run_measures_every_case_compiled_and_not(capsys):
     assert "idm traffic" in capsys.readouterr().out
 
 
-def test_a_step_is_the_sum_of_its_halves():
+def test_step_times_are_consistent_with_their_halves():
     case = world._case(read_packed(world.SHIPPED), {"horizon": 12}, 2)
 
     assert case["steps"] == 24

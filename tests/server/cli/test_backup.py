@@ -1,4 +1,4 @@
-"""Backups of a worker that works, and what comes back of them."""
+"""Backup of a live worker, and restore."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def revisions(folder: Path) -> int | None:
     return newest and newest[0]
 
 
-def test_a_backup_of_a_store_that_is_written_to_is_whole(data, tmp_path):
+def test_a_backup_during_writes_is_consistent(data, tmp_path):
     stop, written = threading.Event(), []
 
     async def write(store: Store) -> None:
@@ -63,7 +63,7 @@ def test_a_backup_of_a_store_that_is_written_to_is_whole(data, tmp_path):
     assert before <= revisions(tmp_path / "new") <= after
 
 
-def test_assets_come_along_and_what_is_unfinished_does_not(data, tmp_path):
+def test_assets_are_backed_up_without_unfinished_ones(data, tmp_path):
     backup(tmp_path / "a.backup", data=data)
     restore(tmp_path / "a.backup", data=tmp_path / "new")
     assets = tmp_path / "new" / "assets"
@@ -71,20 +71,20 @@ def test_assets_come_along_and_what_is_unfinished_does_not(data, tmp_path):
     assert (assets / "car.r2a" / "asset.json").read_text() == "{}"
 
 
-def test_backups_and_what_comes_back_of_them_are_for_their_owner_alone(data, tmp_path):
+def test_backups_and_restored_stores_are_readable_by_their_owner_only(data, tmp_path):
     backup(tmp_path / "a.backup", data=data)
     restore(tmp_path / "a.backup", data=tmp_path / "new")
     for file in (tmp_path / "a.backup", tmp_path / "new" / "real2sim.db"):
         assert file.stat().st_mode & 0o077 == 0
 
 
-def test_nothing_is_restored_below_a_worker_that_works(data, tmp_path):
+def test_restoring_a_folder_in_use_is_refused(data, tmp_path):
     backup(tmp_path / "a.backup", data=data)
     with owned_folder(data), pytest.raises(StateFolderError, match="in use"):
         restore(tmp_path / "a.backup", data=data, overwrite=True)
 
 
-def test_a_store_that_is_there_is_replaced_when_that_is_asked_for_and_moved_aside(data, tmp_path):
+def test_overwrite_replaces_an_existing_store_and_keeps_a_copy(data, tmp_path):
     backup(tmp_path / "a.backup", data=data)
 
     async def edit(store: Store) -> None:
@@ -102,7 +102,7 @@ def test_a_store_that_is_there_is_replaced_when_that_is_asked_for_and_moved_asid
     assert newest[0] == 1
 
 
-def test_a_damaged_backup_is_refused_and_leaves_the_store_alone(data, tmp_path):
+def test_a_damaged_backup_is_refused_and_the_store_is_unchanged(data, tmp_path):
     backup(tmp_path / "a.backup", data=data)
     content = bytearray((tmp_path / "a.backup").read_bytes())
     content[len(content) // 2] ^= 0xFF
@@ -115,7 +115,7 @@ def test_a_damaged_backup_is_refused_and_leaves_the_store_alone(data, tmp_path):
         restore(tmp_path / "a.backup", data=data, overwrite=True)
 
 
-def test_a_backup_writes_nowhere_but_where_it_should(data, tmp_path):
+def test_a_backup_with_paths_outside_its_folder_is_refused(data, tmp_path):
     backup(tmp_path / "a.backup", data=data)
     evil = tmp_path / "evil"
     evil.write_text("x")
@@ -127,13 +127,13 @@ def test_a_backup_writes_nowhere_but_where_it_should(data, tmp_path):
     assert not (tmp_path / "escaped").exists()
 
 
-def test_a_backup_never_replaces_a_file(data, tmp_path):
+def test_a_backup_does_not_overwrite_a_file(data, tmp_path):
     (tmp_path / "a.backup").write_text("mine")
     with pytest.raises(CommandError, match="exists already"):
         backup(tmp_path / "a.backup", data=data)
 
 
-def test_a_store_on_a_server_is_for_its_own_tools(monkeypatch, tmp_path):
+def test_a_database_server_is_refused_in_favour_of_pg_dump(monkeypatch, tmp_path):
     monkeypatch.setenv("REAL2SIM_STORE_URL", "postgresql+pg8000://user@host/name")
     with pytest.raises(CommandError, match="pg_dump"):
         backup(tmp_path / "a.backup")

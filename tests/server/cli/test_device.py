@@ -1,4 +1,4 @@
-"""``--backend`` and ``--device``, and what ``doctor`` says of CUDA."""
+"""The options ``--backend`` and ``--device``, and the CUDA report of ``doctor``."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ def no_device(monkeypatch: pytest.MonkeyPatch) -> None:
     select_backend.cache_clear()
 
 
-def test_the_device_chooses_the_backend() -> None:
+def test_the_device_selects_the_backend() -> None:
     assert chosen_backend("auto", None) == "auto"
     assert chosen_backend("auto", "cpu") == "cpu"
     assert chosen_backend("auto", "cuda") == "cuda"
     assert chosen_backend("reference", "cpu") == "reference"
 
 
-def test_a_numbered_device_is_the_only_one_that_the_process_sees(
+def test_a_numbered_device_becomes_the_only_visible_one(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "2,5")
@@ -43,17 +43,19 @@ def test_a_numbered_device_is_the_only_one_that_the_process_sees(
 
 
 @pytest.mark.parametrize("device", ["gpu", "cuda:", "cuda:x", "cpu:0", ""])
-def test_a_device_that_is_none_is_refused(device: str) -> None:
+def test_an_unknown_device_is_refused(device: str) -> None:
     with pytest.raises(CommandError, match="allowed are cpu, cuda"):
         chosen_backend("auto", device)
 
 
-def test_a_backend_of_another_device_is_refused() -> None:
+def test_a_backend_for_another_device_is_refused() -> None:
     with pytest.raises(CommandError, match="does not draw on --device cpu"):
         chosen_backend("cuda", "cpu")
 
 
-def test_a_reconstruction_that_cannot_draw_ends_before_it_reads_anything(tmp_path: Path) -> None:
+def test_a_reconstruction_with_an_unusable_backend_fails_before_reading_the_log(
+    tmp_path: Path,
+) -> None:
     options = ReconstructOptions(backend="cuda")
     with pytest.raises(RenderError, match="'cuda' is not usable"):
         reconstruct(tmp_path / "no_such_log", tmp_path / "scene.r2s", options)
@@ -64,20 +66,20 @@ def doctor(*arguments: str) -> tuple[int, str]:
     return done.exit_code, done.output
 
 
-def test_doctor_says_what_is_used_and_what_to_install() -> None:
+def test_doctor_reports_the_backend_and_what_to_install() -> None:
     code, output = doctor()
     assert code == 0
     assert "used" in output
     assert "real2sim[server,cuda]" in output or "driver" in output
 
 
-def test_doctor_fails_where_cuda_is_needed_and_not_usable() -> None:
+def test_doctor_fails_if_cuda_is_required_but_unusable() -> None:
     code, output = doctor("--need-cuda")
     assert code == 1
     assert "CUDA is not usable" in output
 
 
-def test_doctor_asks_what_to_build_for_where_there_is_no_gpu() -> None:
+def test_doctor_asks_for_an_architecture_without_a_gpu() -> None:
     code, output = doctor("--build-gpu")
     assert code == 1
     assert "--arch sm_90" in output
@@ -86,7 +88,7 @@ def test_doctor_asks_what_to_build_for_where_there_is_no_gpu() -> None:
     assert "'hopper'" in output
 
 
-def test_doctor_compiles_no_kernels_that_are_there_already(
+def test_doctor_does_not_recompile_usable_kernels(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     built = BuiltKernels(tmp_path / "csrc.so", ("9.0",))
@@ -106,13 +108,13 @@ def test_doctor_compiles_no_kernels_that_are_there_already(
     assert "takes minutes" in doctor("--build-gpu", "--arch", "sm_90")[1]
 
 
-def test_doctor_checks_no_gpu_where_there_is_none() -> None:
+def test_doctor_gpu_check_fails_without_a_gpu() -> None:
     code, output = doctor("--gpu-check")
     assert code == 1
     assert "there is no GPU to check" in output
 
 
-def test_doctor_says_what_the_serving_kernels_take_without_a_gpu(
+def test_doctor_reports_serving_kernel_occupancy_without_a_gpu(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("cuda.core")
@@ -137,7 +139,7 @@ def test_doctor_says_what_the_serving_kernels_take_without_a_gpu(
     assert "blend on sm_90" in output
 
 
-def test_doctor_says_what_the_solver_takes_in_both_precisions(
+def test_doctor_reports_solver_kernel_occupancy_in_both_precisions(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("cuda.core")
@@ -156,7 +158,7 @@ def test_doctor_says_what_the_solver_takes_in_both_precisions(
     assert found == [("advance_blocks (single)", 0.25), ("advance_blocks (double)", 0.125)]
 
 
-def test_the_bench_of_the_solver_on_a_gpu_says_what_it_lacks() -> None:
+def test_the_gpu_solver_bench_reports_missing_requirements() -> None:
     from real2sim_server.render._cuda.needs import unmet_nvrtc_need
 
     if unmet_nvrtc_need() is None:

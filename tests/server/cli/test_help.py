@@ -1,4 +1,4 @@
-"""What ``--help`` says of every command, the client's and the worker's."""
+"""The ``--help`` texts of all commands of the client and the worker."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def shown(path) -> str:
 
 
 def words(text: str | None) -> list[str]:
-    """Of a help text in its source; Markdown shows what stands between backquotes without them."""
+    """Words of a help text in its source. Rendered Markdown omits the backquotes."""
     return (text or "").replace("`", "").split()
 
 
@@ -53,11 +53,11 @@ def test_every_word_of_the_help_is_shown(path):
         (("replay",), "Width of the video [px]."),
     ],
 )
-def test_units_are_shown(path, unit):
+def test_units_are_shown_in_the_help(path, unit):
     assert unit in shown(path)
 
 
-def test_every_command_stands_in_one_panel():
+def test_every_command_is_in_one_panel():
     listed = " ".join(PANELS.values()).split()
     assert sorted(listed) == sorted(path[0] for path in COMMANDS if len(path) == 1)
 
@@ -70,7 +70,7 @@ def test_panels_and_their_commands_are_shown_in_order():
     assert [word for word in first if not word.startswith("-")] == " ".join(PANELS.values()).split()
 
 
-def test_the_help_says_which_commands_the_sdk_has(monkeypatch):
+def test_the_help_lists_the_commands_of_the_sdk_alone(monkeypatch):
     monkeypatch.setattr("real2sim.cli.entry_points", lambda group: ())
     own = typer.main.get_command(build_app()).commands
     _, told = shown(()).split("With the SDK alone you have ")
@@ -78,7 +78,7 @@ def test_the_help_says_which_commands_the_sdk_has(monkeypatch):
 
 
 @pytest.mark.parametrize("words", ["serve", "render scene -o out.png", "token list"])
-def test_a_command_of_the_worker_says_what_to_install(words, monkeypatch):
+def test_a_worker_command_without_its_libraries_says_what_to_install(words, monkeypatch):
     monkeypatch.setattr("real2sim_server.console.SERVER_MODULES", ("a_library_of_the_worker",))
     done = CliRunner().invoke(APP, words.split(), env={"COLUMNS": "400"})
     assert done.exit_code == 1

@@ -1,6 +1,6 @@
-"""``--json`` of every command of the worker, on real figures.
+"""The ``--json`` option of every worker command, on real figures.
 
-Benches have theirs in ``benchmarks/test_environment.py``, commands of the client in its own tests.
+Benches are tested in ``benchmarks/test_environment.py``, client commands in the client's tests.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ MADE = {
     "run": "gallery:ccrs --seconds 1 --save {episode} --scene-out {flat}",
     "export": "{tiny} --out {splats} --object car_red",
 }
-"""What others read; in this order."""
+"""Commands whose output is read by others, in order."""
 COMMANDS = {
     **MADE,
     "log-info": "{log} --check",
@@ -70,7 +70,7 @@ def figures_of(command: str, words: dict[str, Any], path: Path) -> Any:
 
 @pytest.fixture(scope="module")
 def made(tiny_scene, tmp_path_factory):
-    """Paths by name, and the figures of the commands that made them."""
+    """Paths by name, and the figures of the commands that created them."""
     folder = tmp_path_factory.mktemp("figures")
     names = {"log": "log", "street": "street.r2s", "episode": "a.r2e", "tiny": "tiny.r2s"}
     names |= {"flat": "flat.r2s", "splats": "splats.ply", "roads": "a.osm", "moving": "moving"}
@@ -84,7 +84,7 @@ def made(tiny_scene, tmp_path_factory):
     return words, found
 
 
-def test_every_command_with_figures_is_here():
+def test_every_command_with_a_json_option_is_tested():
     commands = typer.main.get_command(build_app()).commands  # type: ignore[attr-defined]
     with_figures = {
         name
@@ -95,7 +95,7 @@ def test_every_command_with_figures_is_here():
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_figures_of_a_command_are_json(made, command, tmp_path):
+def test_commands_write_json_figures(made, command, tmp_path):
     words, found = made
     figures = found.get(command) or figures_of(command, words, tmp_path / "figures.json")
     assert figures

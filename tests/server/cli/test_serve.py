@@ -1,4 +1,4 @@
-"""How ``real2sim serve`` begins and ends, seen from outside."""
+"""Start and exit of ``real2sim serve``, seen from outside."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ WITHOUT_CUDA = "import torch; torch.cuda.is_available = lambda: False\n"
 
 @pytest.fixture
 def serve(tmp_path) -> Callable[..., Finished]:
-    """Runs ``real2sim serve`` to its end."""
+    """Run ``real2sim serve`` until it exits."""
 
     def run(*arguments: str, before: str = "", **variables: str) -> Finished:
         return run_real2sim(
@@ -45,13 +45,13 @@ def folders(tmp_path) -> dict[str, str]:
     }
 
 
-def test_a_lost_device_ends_the_command_with_an_error_code(serve, folders):
+def test_a_lost_device_exits_with_an_error(serve, folders):
     done = serve(before=LOST, **folders)
     assert done.exit_code == 1, done.printed
     assert "device lost" in done.printed
 
 
-def test_a_worker_that_is_to_draw_on_cuda_and_cannot_is_refused_in_a_sentence(serve, folders):
+def test_an_unusable_cuda_backend_is_refused_without_a_traceback(serve, folders):
     done = serve(**(folders | {"BACKEND": "cuda"}), before=WITHOUT_CUDA)
     assert done.exit_code == 1
     assert "Traceback" not in done.printed
@@ -59,7 +59,7 @@ def test_a_worker_that_is_to_draw_on_cuda_and_cannot_is_refused_in_a_sentence(se
     assert "pip install" in done.printed or "driver" in done.printed
 
 
-def test_a_store_that_cannot_be_opened_is_told_in_a_sentence(serve, folders):
+def test_an_unreachable_store_is_reported_without_a_traceback(serve, folders):
     url = "postgresql+pg8000://nobody:hunter2@127.0.0.1:9/none"
     done = serve(STORE_URL=url, LOG_FORMAT="json", **folders)
     assert done.exit_code == 1
@@ -70,21 +70,21 @@ def test_a_store_that_cannot_be_opened_is_told_in_a_sentence(serve, folders):
     assert len(done.printed) < 1500
 
 
-def test_a_short_token_is_refused_without_showing_it(serve, folders):
+def test_a_short_token_is_refused_without_revealing_it(serve, folders):
     done = serve(TOKEN="hunter2", **folders)
     assert done.exit_code == 1
     assert "setting token" in done.printed
     assert "hunter2" not in done.printed
 
 
-def test_a_misspelt_variable_is_refused_with_the_setting_that_is_meant(serve, folders):
+def test_a_misspelt_variable_is_refused_with_a_suggestion(serve, folders):
     done = serve(TOKEN_FLIE="x", **folders)
     assert done.exit_code == 1
     assert "REAL2SIM_TOKEN_FLIE is not a setting; do you mean REAL2SIM_TOKEN_FILE?" in done.printed
 
 
-def test_other_unknown_variables_are_not_in_the_way():
-    # Kubernetes sets such variables for a service of this name.
+def test_unknown_variables_without_a_similar_setting_are_tolerated():
+    # Kubernetes sets such variables for a service with this name.
     names = ["REAL2SIM_SERVICE_PORT_HTTP", "REAL2SIM_PORT", "REAL2SIM_URL", "HOME"]
     assert unknown_variables(names) == {"REAL2SIM_SERVICE_PORT_HTTP": None}
 
@@ -98,12 +98,12 @@ def test_a_token_is_read_from_a_file(tmp_path, monkeypatch):
         Settings(token="battery staple")
 
 
-def test_a_token_file_that_is_not_there_is_told(serve, folders, tmp_path):
+def test_a_missing_token_file_is_reported(serve, folders, tmp_path):
     done = serve("--token-file", str(tmp_path / "none"), **folders)
     assert done.exit_code == 1
     assert "the token cannot be read" in done.printed
 
 
-def test_a_token_as_an_argument_is_warned_of(serve, folders):
+def test_a_token_on_the_command_line_gives_a_warning(serve, folders):
     done = serve("--token", "correct horse", before=LOST, **folders)
     assert "--token shows in the process list" in done.printed

@@ -1,4 +1,4 @@
-"""The schema of a store, looked at and brought up to date from the command line."""
+"""Status and migration of a store's schema from the command line."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ def write_version(data, version: str) -> None:
     connection.close()
 
 
-def test_a_new_store_gets_its_tables_once(tmp_path, capsys):
+def test_migrate_creates_tables_once(tmp_path, capsys):
     migrate(data=tmp_path)
     assert f"done: {schema.SCHEMA_VERSION}: all tables" in capsys.readouterr().out
     migrate(data=tmp_path)
     assert "nothing to do" in capsys.readouterr().out
 
 
-def test_status_tells_pending_migrations_and_changes_nothing(data, capsys, monkeypatch):
+def test_status_lists_pending_migrations_without_applying_them(data, capsys, monkeypatch):
     capsys.readouterr()
     monkeypatch.setattr(schema, "SCHEMA_VERSION", 2)
     monkeypatch.setattr(schema, "_revisions", lambda: [(1, "first"), (2, "colours")])
@@ -45,20 +45,20 @@ def test_status_tells_pending_migrations_and_changes_nothing(data, capsys, monke
         assert "real2sim store migrate" in told
 
 
-def test_a_store_of_a_newer_program_is_refused_with_what_to_do(data):
+def test_a_store_with_a_newer_schema_is_refused_with_a_hint(data):
     write_version(data, "0099")
     for command in (status, migrate):
         with pytest.raises(StoreError, match="restore a backup"):
             command(data=data)
 
 
-def test_a_folder_without_a_store_is_told_of(tmp_path):
+def test_a_folder_without_a_store_is_reported_and_not_created(tmp_path):
     with pytest.raises(CommandError, match="there is no store"):
         status(data=tmp_path / "elsewhere")
     assert not (tmp_path / "elsewhere").exists()
 
 
-def test_a_database_that_cannot_be_reached_is_told_of_without_its_password():
+def test_an_unreachable_database_is_reported_without_its_password():
     with pytest.raises(CommandError) as told:
         status(url="postgresql+pg8000://me:secret@127.0.0.1:1/none")
     assert "secret" not in str(told.value)

@@ -9,7 +9,7 @@ from real2sim_server.synthetic import SyntheticConfig, synthesize
 
 
 @pytest.mark.slow
-def test_a_log_without_boxes_gets_those_of_what_moves(tmp_path):
+def test_a_log_without_boxes_gets_tracks_of_moving_objects(tmp_path):
     config = SyntheticConfig(frames=24, width=96, height=64, moving_cars=3, parked_cars=4)
     log = open_log(synthesize(config, tmp_path / "log"))
     track(log=tmp_path / "log", out=tmp_path / "tracked")

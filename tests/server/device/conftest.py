@@ -1,4 +1,4 @@
-"""The pretended device as a fixture, and the CUDA backend on it."""
+"""Fixtures for the pretended device and the CUDA backend on it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from . import gsplat_stand_in, pretended
 
 @pytest.fixture
 def device_counts() -> Iterator[pretended.Counts]:
-    """The device is there; counts launches, copies and waits."""
+    """Activates the pretended device. Counts launches, copies and waits."""
     with pretended.pretending() as counts:
         yield counts
 
@@ -23,7 +23,7 @@ def device_counts() -> Iterator[pretended.Counts]:
 def cuda_backend(
     device_counts: pretended.Counts, monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[Backend]:
-    """The CUDA backend on the pretended device, gsplat by a stand-in."""
+    """The CUDA backend on the pretended device, with a stand-in for gsplat."""
     name = "real2sim_server.render._cuda.gsplat"
     monkeypatch.setitem(sys.modules, "gsplat", gsplat_stand_in.module())
     monkeypatch.delitem(sys.modules, name, raising=False)

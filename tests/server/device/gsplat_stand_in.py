@@ -1,8 +1,8 @@
-"""The functions of gsplat 1.5.3 that the project calls, by the reference rasterizer.
+"""The gsplat 1.5.3 functions used by the project, implemented with the reference rasterizer.
 
-They take tensors of the pretended device only, as gsplat takes those of a GPU only, and give what
-gsplat gives where the project looks at it, with gradients. Checks what the project does around
-gsplat; gsplat's own arithmetic needs a GPU.
+Like gsplat on a GPU, they only accept tensors of the pretended device. They return the results that
+the project uses, with gradients. This tests the code around gsplat. gsplat's own arithmetic needs a
+GPU.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ DOUBLE = torch.float64
 
 
 class _OnHost(torch.autograd.Function):
-    """``function`` of the held values, differentiated by torch."""
+    """``function`` on the held values, differentiated by torch."""
 
     @staticmethod
     def forward(ctx: Any, function: Callable[..., tuple[Tensor, ...]], *given: Tensor) -> Any:
@@ -141,7 +141,7 @@ def _project(
         opacity = opacity * ratio.clamp(min=1e-30).sqrt()
     reach = (2 * (opacity.detach() / ALPHA_MIN).clamp(min=1).log()).sqrt()
     extents = reach[:, None] * blurred.detach().diagonal(dim1=-2, dim2=-1).sqrt()
-    # gsplat's packed projection drops what does not touch the image.
+    # gsplat's packed projection drops Gaussians that do not touch the image.
     bounds = torch.tensor(size, dtype=DOUBLE)
     touching = ((means2d + extents > 0) & (means2d - extents < bounds)).all(-1).detach()
     large = (extents.ceil() > options["radius_clip"]).any(-1)
@@ -168,7 +168,7 @@ def _blend(
 
 
 class _Sorted(ScreenWatch):
-    """Gives what it sees of sorted splats to a watch of unsorted ones."""
+    """Passes sorted splats to an observer of unsorted ones."""
 
     def __init__(self, watch: ScreenWatch, order: Tensor) -> None:
         self.absolute, self._order = watch.absolute, order
@@ -180,7 +180,7 @@ class _Sorted(ScreenWatch):
 def instance_image(
     meta: dict[str, Any] | None, instance_ids: Tensor, shape: tuple[int, int, int]
 ) -> Tensor:
-    """In place of the CUDA kernel that walks gsplat's tile lists."""
+    """Replaces the CUDA kernel that traverses gsplat's tile lists."""
     if meta is None:
         return torch.zeros(shape, device=instance_ids.device).to(torch.uint16)
     ids = held(instance_ids)[held(meta["gaussian_ids"])]
@@ -190,7 +190,7 @@ def instance_image(
 def median_depth_image(
     meta: dict[str, Any] | None, shape: tuple[int, int, int], device: torch.device
 ) -> Tensor:
-    """In place of the same kernel."""
+    """Replaces the same kernel."""
     if meta is None:
         return torch.zeros(shape, device=device)
     ids = torch.zeros_like(held(meta["gaussian_ids"]))
@@ -209,7 +209,7 @@ def _walked(meta: dict[str, Any], ids: Tensor, shape: tuple[int, int, int], imag
 
 
 def module() -> types.ModuleType:
-    """To be found as ``gsplat``."""
+    """A module to install as ``gsplat``."""
     made = types.ModuleType("gsplat")
     for function in (rasterization, spherical_harmonics, quat_scale_to_covar_preci):
         setattr(made, function.__name__, function)

@@ -1,8 +1,8 @@
-"""A device that is none: torch believes in it, and every operation is done on the CPU.
+"""A pretended torch device. Every operation runs on the CPU.
 
-Tensors on it say ``pretended:0``. An operation that meets tensors of two devices is refused as CUDA
-refuses it, as is a conversion to NumPy; kernel launches, copies and waits are counted. What a GPU
-worker does is so checked on a machine without a GPU. It holds in every thread.
+Its tensors report ``pretended:0``. As with CUDA, an operation on tensors of two devices and a
+conversion to NumPy raise errors. Kernel launches, copies and waits are counted. This tests the code
+of a GPU worker on a machine without a GPU. It applies to all threads.
 """
 
 from __future__ import annotations
@@ -19,26 +19,26 @@ from torch.utils.backend_registration import _setup_privateuseone_for_python_bac
 
 aten = torch.ops.aten
 
-# Before anything is differentiated in this process: torch prepares for the devices of then.
+# Before the first backward pass of this process: torch then fixes its set of devices.
 _setup_privateuseone_for_python_backend("pretended")
 DEVICE = torch.device("pretended:0")
 
 TAKES_BOTH = {aten.copy_.default, aten._to_copy.default}
-"""Operations that may meet tensors of two devices."""
+"""Operations that accept tensors of two devices."""
 INDEXED = {aten.index.Tensor, aten.index_put.default, aten.index_put_.default}
-"""Indices may lie on the CPU where what they index lies on the device."""
+"""CPU indices are allowed for tensors on the device."""
 WAITING = {aten.nonzero.default, aten._unique2.default, aten.masked_select.default}
 VIEWS = ("view", "slice", "select", "transpose", "t.default", "permute", "squeeze", "expand")
 VIEWS += ("detach", "alias", "as_strided", "split", "unbind", "diagonal", "lift_fresh", "unfold")
 
 
 FACTORIES = ("tensor", "as_tensor", "eye", "arange", "linspace")
-"""torch fills these tensors, or gives them their size, where no operation can be seen."""
+"""torch creates these tensors without a visible operation."""
 
 
 @dataclass
 class Counts:
-    """What the device was asked for."""
+    """Operations on the device."""
 
     launches: int = 0
     to_device: int = 0
@@ -50,11 +50,11 @@ counts = Counts()
 
 
 class MixedDevicesError(RuntimeError):
-    """Tensors of two devices met."""
+    """An operation received tensors of two devices."""
 
 
 class Pretended(torch.Tensor):
-    """A tensor that says it lies on the device; ``held`` has its values."""
+    """A tensor that reports the pretended device. ``held`` contains its values."""
 
     held: torch.Tensor
 
@@ -92,12 +92,12 @@ class Pretended(torch.Tensor):
 
 
 def held(value: Any) -> Any:
-    """What is computed with: values of a pretended tensor, anything else as it is."""
+    """The CPU tensor of a pretended tensor. Other values are returned unchanged."""
     return value.held if isinstance(value, Pretended) else value
 
 
 def run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
-    """Do an operation on the CPU, after a look at where its tensors lie."""
+    """Run an operation on the CPU after checking the devices of its tensors."""
     tensors = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, torch.Tensor)]
     here = [tensor for tensor in tensors if isinstance(tensor, Pretended)]
     _check(func, args, tensors, here)
@@ -156,12 +156,12 @@ def _count(func: Any, args: Any, here: list[Any], *, to_host: bool) -> None:
 
 
 def on_copy(shape: torch.Size) -> None:
-    """Called with the shape of what is copied to the device or from it; for tests to replace."""
+    """Hook for tests, called with the shape of each copy to or from the device."""
 
 
 @contextmanager
 def pretending() -> Iterator[Counts]:
-    """The device is there; what it is asked for is counted from zero."""
+    """Activate the device inside the block, with counts reset to zero."""
     plain = {name: getattr(torch, name) for name in FACTORIES}
     for name, make in plain.items():
         setattr(torch, name, functools.partial(_made, make))

@@ -1,4 +1,4 @@
-"""Kernels of serving and of LiDARs on the pretended device."""
+"""Serving and LiDAR kernels on the pretended device."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from . import pretended
 
 
 class OnPretended(KernelTwin):
-    """Runs kernels on what pretended tensors hold, and on no other memory; counts launches."""
+    """Runs kernels on the values of pretended tensors only. Counts launches."""
 
     def launch(self, kernel: str, blocks: int, space: int, argument: int = 0) -> None:
         pretended.counts.launches += 1
@@ -23,7 +23,7 @@ class OnPretended(KernelTwin):
 
 
 class PretendedLauncher(OnPretended, TwinLauncher):
-    """Of serving."""
+    """Launcher for serving kernels."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -31,7 +31,7 @@ class PretendedLauncher(OnPretended, TwinLauncher):
 
 
 class PretendedCastLauncher(OnPretended, CastTwinLauncher):
-    """Of LiDARs."""
+    """Launcher for LiDAR kernels."""
 
     def __init__(self) -> None:
         super().__init__()

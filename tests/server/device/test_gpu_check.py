@@ -1,4 +1,4 @@
-"""The check of a GPU, on the pretended device: it runs through and tells what it found."""
+"""The GPU check, run on the pretended device."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def devices(training: str | Backend = "cpu") -> Devices:
     return Devices(lambda: NvrtcBackend(PretendedLauncher()), training, "cpu", casting, "pretended")
 
 
-def test_pictures_and_times_are_checked_and_told_as_a_table(
+def test_images_and_timings_are_checked_and_reported_as_a_table(
     device_counts: pretended.Counts,
 ) -> None:
     check = run(devices(), SMALL, parts=["pictures", "lidar", "frames", "memory"])
@@ -52,7 +52,7 @@ def test_pictures_and_times_are_checked_and_told_as_a_table(
     assert "rays that end elsewhere | 0.000% | 0.1 % (holds) |" in text
 
 
-def test_a_part_that_fails_says_why_and_the_others_go_on() -> None:
+def test_a_failing_part_reports_its_error_and_the_others_run() -> None:
     def broken() -> Backend:
         raise RuntimeError("CUDA error: no kernel image")
 
@@ -64,7 +64,7 @@ def test_a_part_that_fails_says_why_and_the_others_go_on() -> None:
 
 
 @pytest.mark.slow
-def test_all_parts_run_through(device_counts: pretended.Counts, cuda_backend: Backend) -> None:
+def test_all_parts_run(device_counts: pretended.Counts, cuda_backend: Backend) -> None:
     begun: list[str] = []
     check = run(devices(cuda_backend), SMALL, on_part=begun.append)
     assert check.failed == {}

@@ -1,4 +1,4 @@
-"""A frame for serving: so many launches, copies and waits, whatever is in the world."""
+"""The number of launches, copies and waits per serving frame does not depend on the world."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ COLOUR = TimeColour(torch.full((30, 2, 3), 0.1), "cosine", 0, 10**7)
 
 
 @pytest.mark.parametrize("objects", [2, 40])
-def test_a_frame_is_one_copy_to_the_device_and_few_launches(
+def test_a_frame_needs_one_copy_to_the_device_and_few_launches(
     serving: NvrtcBackend, device_counts: pretended.Counts, objects: int
 ) -> None:
     def draw(seconds: float) -> None:
@@ -79,12 +79,12 @@ def test_a_frame_is_one_copy_to_the_device_and_few_launches(
         wanted = ["rgb", "depth", "instance"]
         render_cameras(drawn, cameras(), np.eye(4), sky=SKY, modalities=wanted, backend=serving)
 
-    draw(0.0)  # Brings the clouds over, and reserves memory.
+    draw(0.0)  # Uploads the clouds and reserves memory.
     device_counts.__init__()  # type: ignore[misc]
     draw(0.5)
     assert device_counts.launches <= 25
     assert device_counts.to_device == 1
-    # The counters of the kernels, and all images: what follows is drawn beside this copy.
+    # One for the kernel counters and one for all images. The next frame is drawn during the second.
     assert device_counts.to_host == 2
     assert device_counts.waits == 2
 
@@ -100,7 +100,7 @@ def test_the_next_frame_is_drawn_before_the_last_one_is_copied(
     started(0.0)
     device_counts.__init__()  # type: ignore[misc]
     first, second = started(0.2), started(0.6)
-    # Each has waited for its kernels, by their counters, and for no image.
+    # Each frame has waited for the counters of its kernels, but for no image.
     assert (device_counts.to_host, device_counts.waits) == (2, 2)
     for frames, seconds in ((first, 0.2), (second, 0.6)):
         expected = render_cameras(world(3, seconds), cameras(), np.eye(4), sky=SKY, backend=serving)
@@ -110,7 +110,7 @@ def test_the_next_frame_is_drawn_before_the_last_one_is_copied(
             np.testing.assert_array_equal(frame.images["depth"], other.images["depth"])
 
 
-def test_pictures_of_the_device_are_those_of_the_reference(serving: NvrtcBackend) -> None:
+def test_device_images_match_the_reference(serving: NvrtcBackend) -> None:
     viewmats = np.stack([camera.viewmat(np.eye(4)) for camera in cameras()[:1]])
     Ks = np.stack([camera.K for camera in cameras()[:1]])
     given, expected = (
@@ -124,7 +124,7 @@ def test_pictures_of_the_device_are_those_of_the_reference(serving: NvrtcBackend
     assert torch.equal(given.instance.cpu(), expected.instance)
 
 
-def test_frames_are_those_of_the_cpu(serving: NvrtcBackend) -> None:
+def test_device_frames_match_the_reference(serving: NvrtcBackend) -> None:
     given, expected = (
         render_cameras(world(5, 0.2), cameras()[:2], np.eye(4), sky=SKY, backend=backend)
         for backend in (serving, "reference")

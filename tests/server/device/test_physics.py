@@ -1,4 +1,4 @@
-"""The solver on the pretended device: what it launches, copies and waits for."""
+"""Launches, copies and waits of the solver on the pretended device."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.skipif(COMPILER is None, reason=NEEDS_COMPILER)
 
 
 class PretendedLauncher(TwinLauncher):
-    """Runs kernels on what pretended tensors hold, and on no other memory."""
+    """Runs kernels on the values of pretended tensors, and refuses other memory."""
 
     def __init__(self, precision: str) -> None:
         super().__init__(precision)
@@ -34,7 +34,7 @@ class PretendedLauncher(TwinLauncher):
 
 
 def dropped() -> Solver:
-    """A soft block above the ground, with a box that moves below it."""
+    """A soft block above the ground, and a box that moves below it."""
     pose = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0.0], [0, 0, 0, 1]]
     block = lattice([0.2] * 3, spacing=0.05, density=200)
     pose_block = [[1, 0, 0, 0.01], [0, 1, 0, 0.02], [0, 0, 1, 0.25], [0, 0, 0, 1]]
@@ -52,7 +52,7 @@ def solver(device_counts: pretended.Counts) -> Solver:
     return on_twin(dropped, PretendedLauncher)
 
 
-def test_a_check_interval_is_one_copy_each_way_one_wait_and_two_launches_a_substep(
+def test_a_check_interval_needs_one_copy_each_way_one_wait_and_two_launches_per_substep(
     solver: Solver, device_counts: pretended.Counts
 ) -> None:
     simulation = solver.simulation
@@ -62,23 +62,23 @@ def test_a_check_interval_is_one_copy_each_way_one_wait_and_two_launches_a_subst
     measure = simulation.measure()
     assert simulation.contacts()[0].shape == (1, 2, 8)
     assert measure.finite
-    # One begins, one scatters, two are a substep, four measure and add up contacts.
+    # One to begin, one to scatter, two per substep, four to measure and sum up contacts.
     assert device_counts.launches == 1 + 1 + 2 * 16 + 4
-    # The way of moving colliders; and the report.
+    # Upload the motion of the colliders, and download the report.
     assert device_counts.to_device == 1
     assert device_counts.to_host == 1
     assert device_counts.waits == 1
 
 
-def test_the_same_launches_come_again_whatever_particles_do(solver: Solver) -> None:
+def test_the_launch_sequence_is_constant(solver: Solver) -> None:
     launcher = solver.simulation._launcher  # type: ignore[attr-defined]
     for _ in range(6):
         solver.simulation.advance(16, 2e-4, solver.colliders)
-    # So they are captured once: all but the first, which sorts.
+    # The sequence can be captured once, after the initial sort.
     assert len(set(launcher.sequences[2:])) == 1
 
 
-def test_a_whole_step_with_checks_and_states_mixes_no_devices(solver: Solver) -> None:
+def test_steps_checks_and_snapshots_mix_no_devices(solver: Solver) -> None:
     plain = dropped()
     for run in (plain, solver):
         run.step(0.004)

@@ -1,4 +1,4 @@
-"""The pretended device refuses what a GPU refuses."""
+"""The pretended device raises the errors of a GPU."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .pretended import DEVICE, Counts, MixedDevicesError
 NAME = "pretended"
 
 
-def test_tensors_of_two_devices_do_not_meet(device_counts: Counts) -> None:
+def test_operations_on_tensors_of_two_devices_are_refused(device_counts: Counts) -> None:
     here = torch.zeros(3, device=NAME)
     with pytest.raises(MixedDevicesError, match="cpu"):
         here + torch.ones(3)
@@ -22,14 +22,14 @@ def test_tensors_of_two_devices_do_not_meet(device_counts: Counts) -> None:
     assert float((here + 1.5).sum()) == 4.5
 
 
-def test_a_tensor_on_the_device_is_no_numpy_array(device_counts: Counts) -> None:
+def test_converting_a_device_tensor_to_numpy_is_refused(device_counts: Counts) -> None:
     here = torch.zeros(3, device=NAME)
     for convert in (here.numpy, functools.partial(np.asarray, here)):
         with pytest.raises(TypeError, match="cpu"):
             convert()
 
 
-def test_gradients_flow_to_where_the_leaf_lies(device_counts: Counts) -> None:
+def test_gradients_are_on_the_device_of_their_leaf(device_counts: Counts) -> None:
     on_host = torch.ones(3, requires_grad=True)
     (on_host.to(NAME) * 2).sum().backward()
     assert on_host.grad is not None

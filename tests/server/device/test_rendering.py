@@ -1,4 +1,4 @@
-"""The CUDA backend never lets tensors of two devices meet, and draws what the reference draws."""
+"""The CUDA backend mixes no devices and matches the reference."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def random_cloud(seed: int, bands: int, count: int = 60) -> GaussianCloud:
     return GaussianCloud(*(torch.from_numpy(part.astype(np.float32)) for part in parts))
 
 
-def test_pictures_of_the_device_are_those_of_the_reference(cuda_backend: Backend) -> None:
+def test_device_images_match_the_reference(cuda_backend: Backend) -> None:
     covars = torch.diag_embed(torch.rand(60, 3, generator=torch.Generator().manual_seed(1)) * 0.02)
     colour = TimeColour(torch.full((60, 2, 3), 0.1), "cosine", 0, 100)
     instances = [

@@ -1,4 +1,4 @@
-"""A whole worker on the device: scenes, edits, sessions, pictures, against the reference."""
+"""A complete worker on the pretended device against the reference."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def on_device(
     device_counts: pretended.Counts,
     monkeypatch: pytest.MonkeyPatch,
 ) -> Iterator[str]:
-    """Name of a backend that works on the pretended device."""
+    """Name of a backend on the pretended device."""
     if request.param == "nvrtc" and COMPILER is None:
         pytest.skip(NEEDS_COMPILER)
     backend: Backend = (
@@ -77,7 +77,7 @@ def on_device(
 
 
 def pictures(client: TestClient) -> list[np.ndarray]:
-    """Of an edited scenario, driven for two steps."""
+    """Images of an edited scenario, driven for two steps."""
     made = client.post("/v1/scenarios", json={"scene": "tiny"})
     scenario = made.json()["scenario_id"]
     edited = client.post(f"/v1/scenarios/{scenario}/operations", json={"operations": EDITS})
@@ -112,7 +112,7 @@ def image(frame: dict[str, Any]) -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_a_worker_on_the_device_shows_what_the_reference_shows(
+def test_a_worker_on_the_device_matches_the_reference(
     start_worker: Callable[[str], TestClient], on_device: str
 ) -> None:
     given, expected = (pictures(start_worker(name)) for name in (on_device, "reference"))
@@ -122,5 +122,5 @@ def test_a_worker_on_the_device_shows_what_the_reference_shows(
         assert here.dtype == there.dtype
         apart = np.abs(here.astype(np.float64) - there.astype(np.float64))
         limit = 1 if here.dtype == np.uint8 else 0.01
-        # Depths are compared in float32, so that which of two comes first may differ in a pixel.
+        # Depths are compared in float32, so the order of two near-equal ones may differ in a pixel.
         assert (apart > limit).mean() < 1e-3

@@ -1,4 +1,4 @@
-"""Steps of several sessions on one scene: one set of launches, the images of each as alone."""
+"""Batched steps of several sessions on one scene give the same images as separate steps."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ SPEC: dict[str, Any] = {"action": "control", "sensors": SENSORS}
 
 
 class Service:
-    """The engine and the step pipeline on the pretended device."""
+    """Engine and step pipeline on the pretended device."""
 
     def __init__(self, backend: Backend) -> None:
         self.engine = Engine()
@@ -73,7 +73,7 @@ class Service:
         return Step(partial(moved, world, steering), cameras, drawn_with=scene)
 
     def run(self, *steps: Awaitable[T]) -> list[T | BaseException]:
-        """What comes of steps that wait for the engine at the same time."""
+        """Results of steps that wait for the engine at the same time."""
         entered, opened = threading.Event(), threading.Event()
 
         def gate() -> None:
@@ -119,7 +119,7 @@ def images(observation: EncodedObservation | BaseException) -> list[bytes]:
 
 
 @pytest.mark.parametrize("codec", ["raw", "png"])
-def test_two_sessions_share_launches_and_see_what_each_sees_alone(
+def test_two_sessions_share_launches_and_get_the_same_images_as_alone(
     service: Service, tiny_scene: Scene, device_counts: pretended.Counts, codec: str
 ) -> None:
     sensors = [sensor | {"codec": codec} for sensor in SENSORS]
@@ -140,7 +140,7 @@ def test_two_sessions_share_launches_and_see_what_each_sees_alone(
     assert device_counts.to_device == 1
 
 
-def test_small_images_of_two_sessions_are_drawn_together_on_the_cpu(
+def test_small_images_of_two_sessions_are_batched_on_the_cpu(
     tiny_scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     backend = CpuBackend()
@@ -162,7 +162,7 @@ def test_small_images_of_two_sessions_are_drawn_together_on_the_cpu(
         batches.clear()
         together = service.run(*(step() for step in steps))
         assert [images(observation) for observation in together] == alone
-        # One for each size.
+        # One batch for each size.
         assert batches == [2, 2]
         large = [sensor | {"detail": "full"} for sensor in SENSORS]
         assert service.step(begun(tiny_scene, sensors=large), 0.1).drawn_with is None
@@ -170,7 +170,7 @@ def test_small_images_of_two_sessions_are_drawn_together_on_the_cpu(
         service.close()
 
 
-def test_what_fails_in_one_session_leaves_the_others_alone(
+def test_a_failing_session_does_not_affect_the_others_in_its_batch(
     service: Service, tiny_scene: Scene
 ) -> None:
     world = begun(tiny_scene)
@@ -189,9 +189,7 @@ def test_what_fails_in_one_session_leaves_the_others_alone(
     )
 
 
-def test_an_image_that_cannot_be_drawn_is_the_trouble_of_its_session(
-    service: Service, tiny_scene: Scene
-) -> None:
+def test_a_failed_render_affects_only_its_session(service: Service, tiny_scene: Scene) -> None:
     sound, broken = (service.step(begun(tiny_scene), 0.1) for _ in range(2))
     change = broken.change
 

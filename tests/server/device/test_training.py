@@ -1,4 +1,4 @@
-"""Training on the device: no two devices meet, no parameter moves, and it learns the same."""
+"""Training on the device mixes no devices, copies no parameters, and learns the same as the CPU."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ OPTIONS = TrainOptions(
     log_every=1000,
     width=32,
     max_width=32,
-    # Whole bodies have more Gaussians than the stand-in draws in a minute.
+    # Full people have more Gaussians than the stand-in renders in a minute.
     directions=DirectionOptions(close=False),
     initialise=InitialiseOptions(
         voxel=1.0, ground_spacing=2.0, object_voxel=0.5, sky_resolution=8, max_colour_frames=2
@@ -70,7 +70,7 @@ def scene(log: DrivingLog) -> Scene:
 
 
 def thinned(cloud: GaussianCloud, count: int) -> GaussianCloud:
-    """At most so many, larger: what is drawn by the stand-in takes seconds as it is."""
+    """At most this many Gaussians, enlarged, so that the stand-in renders in seconds."""
     step = max(1, -(-len(cloud) // count))
     kept = cloud.select(torch.arange(0, len(cloud), step))
     return replace(kept, scales=kept.scales * step**0.5)
@@ -94,7 +94,7 @@ def trained(
         pytest.param("mcmc", 50, marks=pytest.mark.slow),
     ],
 )
-def test_all_that_training_does_lies_on_the_device(
+def test_parameters_and_optimizer_state_are_on_the_device(
     log: DrivingLog, scene: Scene, cuda_backend: Backend, method: str, steps: int, tmp_path: Path
 ) -> None:
     densify = DensifyOptions(
@@ -126,7 +126,7 @@ def test_all_that_training_does_lies_on_the_device(
     assert resumed.model.gaussians.means.device.type == "pretended"
 
 
-def test_what_is_learnt_on_the_device_is_what_the_cpu_learns(
+def test_training_on_the_device_matches_the_cpu(
     log: DrivingLog, scene: Scene, cuda_backend: Backend
 ) -> None:
     options = replace(OPTIONS, densify=DensifyOptions(method="none", hidden_rounds=()))
@@ -140,7 +140,7 @@ def test_what_is_learnt_on_the_device_is_what_the_cpu_learns(
         assert float((given - wanted).abs().mean()) < 1e-3
 
 
-def test_a_step_moves_no_parameter_and_waits_once_for_its_loss(
+def test_a_training_step_copies_no_parameter_and_waits_once_for_its_loss(
     log: DrivingLog,
     scene: Scene,
     cuda_backend: Backend,

@@ -1,4 +1,4 @@
-"""Many worlds as one Gymnasium environment."""
+"""Several worlds as one Gymnasium vector environment."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def straight(worlds: int) -> np.ndarray:
     return np.tile([0.5, 0.0], (worlds, 1)).astype(np.float32)
 
 
-def test_it_is_made_by_its_id(street: Scene) -> None:
+def test_the_environment_is_made_by_its_id(street: Scene) -> None:
     env = gymnasium.make_vec(
         "real2sim_server.learning:real2sim/DriveBatch-v0",
         num_envs=3,
@@ -50,7 +50,7 @@ def test_it_is_made_by_its_id(street: Scene) -> None:
     env.close()
 
 
-def test_images_and_rewards_are_those_of_single_worlds(street: Scene) -> None:
+def test_images_and_rewards_equal_those_of_single_worlds(street: Scene) -> None:
     env = VectorDriveEnv(2, scene=street, cameras=["front"], options={"horizon": 5})
     env.reset(seed=0)
     world = World(street, ScenarioState.of(street), ResetSpec(action="control", horizon=5))
@@ -72,7 +72,7 @@ def test_images_and_rewards_are_those_of_single_worlds(street: Scene) -> None:
     assert np.array_equal(obs["front"][1], to_uint8(drawn.rgb)[0])
 
 
-def test_ended_worlds_begin_anew_at_the_next_step(street: Scene) -> None:
+def test_ended_worlds_reset_at_the_next_step(street: Scene) -> None:
     env = VectorDriveEnv(2, scene=street, options={"horizon": 2})
     first, _ = env.reset(seed=0)
     env.step(straight(2))
@@ -88,7 +88,7 @@ def test_ended_worlds_begin_anew_at_the_next_step(street: Scene) -> None:
     assert (reward > 0).all()
 
 
-def test_ended_worlds_begin_anew_in_the_same_step(street: Scene) -> None:
+def test_ended_worlds_reset_in_the_same_step(street: Scene) -> None:
     env = VectorDriveEnv(
         2, scene=street, options={"horizon": 1}, autoreset_mode=AutoresetMode.SAME_STEP
     )
@@ -101,7 +101,7 @@ def test_ended_worlds_begin_anew_in_the_same_step(street: Scene) -> None:
     assert info["final_obs"][1]["state"][0] > first["state"][1, 0]
 
 
-def test_without_autoreset_ended_worlds_wait_for_a_mask(street: Scene) -> None:
+def test_without_autoreset_ended_worlds_need_a_reset_mask(street: Scene) -> None:
     env = VectorDriveEnv(
         2, scene=street, options={"horizon": 1}, autoreset_mode=AutoresetMode.DISABLED
     )
@@ -114,7 +114,7 @@ def test_without_autoreset_ended_worlds_wait_for_a_mask(street: Scene) -> None:
     env.step(straight(2))
 
 
-def test_seeds_draw_where_episodes_begin(street: Scene) -> None:
+def test_seeds_determine_random_start_times(street: Scene) -> None:
     def begun(seed: int) -> list[int]:
         env = VectorDriveEnv(4, scene=street, options={"horizon": 5}, random_start=3.0)
         env.reset(seed=seed)
@@ -126,7 +126,7 @@ def test_seeds_draw_where_episodes_begin(street: Scene) -> None:
     assert begun(3)[1:] == begun(4)[:-1]
 
 
-def test_a_camera_of_another_aspect_is_cut_at_its_sides(street: Scene) -> None:
+def test_a_camera_with_another_aspect_ratio_is_cropped_at_the_sides(street: Scene) -> None:
     front = street.rig["front"]
     camera = fitted(front, 84, 84)
     scale = 84 / front.height
@@ -143,14 +143,14 @@ def test_a_camera_of_another_aspect_is_cut_at_its_sides(street: Scene) -> None:
         ({"num_envs": 0}, ValueError, "at least one"),
     ],
 )
-def test_what_it_cannot_do_is_refused(
+def test_unsupported_arguments_are_refused(
     street: Scene, arguments: dict, error: type[Exception], named: str
 ) -> None:
     with pytest.raises(error, match=named):
         VectorDriveEnv(**({"num_envs": 2, "scene": street} | arguments))
 
 
-def test_bad_calls_are_refused(street: Scene) -> None:
+def test_invalid_actions_seeds_and_masks_are_refused(street: Scene) -> None:
     env = VectorDriveEnv(2, scene=street)
     with pytest.raises(ValueError, match="actions must be"):
         env.step(np.zeros((3, 2)))
@@ -160,5 +160,5 @@ def test_bad_calls_are_refused(street: Scene) -> None:
         env.reset(options={"reset_mask": np.array([False, False])})
 
 
-def test_the_example_runs() -> None:
+def test_the_docstring_example_runs() -> None:
     assert doctest.testmod(learning).failed == 0

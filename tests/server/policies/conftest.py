@@ -1,4 +1,4 @@
-"""A worker with the tiny scene, for episodes that are compared."""
+"""A worker with the tiny scene, for policy evaluation."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def results(site: RunningWorker, folder: Path) -> list[EpisodeResult]:
-    """Both cases, two seeds; by a blind planner, one that sees, and one that raises."""
+    """Both cases with two seeds, for a blind planner, one that sees, and one that raises."""
     with pytest.MonkeyPatch.context() as patch:
         (folder / "broken.py").write_text(BROKEN)
         patch.chdir(folder)

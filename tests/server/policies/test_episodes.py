@@ -27,23 +27,23 @@ def one(results, policy, case, seed=0):
     return found
 
 
-def test_every_planner_drives_random_cases_with_every_seed_and_others_once(results):
+def test_random_cases_are_driven_with_every_seed_and_others_once(results):
     episodes = {(d.policy, d.case, d.seed) for d in results}
     assert len(episodes) == len(results) == 3 * (1 + 2)
 
 
-def test_a_car_that_brakes_hard_is_hit_by_the_blind_and_not_by_those_that_see(results):
+def test_a_blind_planner_hits_a_braking_car_and_idm_does_not(results):
     assert one(results, "pid", "brakes").reason == "collision"
     assert one(results, "pid", "brakes").figures["at_fault"] == 1
     assert one(results, "idm", "brakes").figures["collisions"] == 0
 
 
-def test_edits_of_a_case_take_effect_for_its_planners(results):
+def test_edits_of_a_case_are_applied(results):
     assert "car_blue" not in one(results, "pid", "free").recording.instants[-1].others.ids
     assert one(results, "pid", "free").figures["collisions"] == 0
 
 
-def test_scores_of_the_report_are_those_of_the_recordings(results, folder):
+def test_reported_scores_match_the_recordings(results, folder):
     figures = json.loads(json.dumps(report_figures(results, folder)))
     assert unconfirmed_scores(figures, folder) == []
     for episode in figures["episodes"]:
@@ -53,13 +53,13 @@ def test_scores_of_the_report_are_those_of_the_recordings(results, folder):
             assert [s.value for s in again] == [s["value"] for s in episode["scores"]]
 
 
-def test_a_score_that_a_recording_does_not_bear_out_is_found(results, folder):
+def test_a_score_that_does_not_match_its_recording_is_detected(results, folder):
     figures = json.loads(json.dumps(report_figures(results, folder)))
     figures["episodes"][0]["scores"][0]["value"] = 0.123
     assert unconfirmed_scores(figures, folder) == [figures["episodes"][0]["recording"]]
 
 
-def test_means_and_spreads_are_those_of_the_episodes(results):
+def test_means_and_deviations_are_computed_over_episodes(results):
     (group,) = [g for g in group_scores(results) if (g.policy, g.case) == ("idm", "brakes")]
     values = [one(results, "idm", "brakes", s).scores()["carla_ds"]["value"] for s in (0, 1)]
     spread = group.scores["carla_ds"]
@@ -68,7 +68,7 @@ def test_means_and_spreads_are_those_of_the_episodes(results):
     assert group.episodes == spread.count == 2
 
 
-def test_a_planner_that_dies_gets_no_scores_and_holds_up_nobody(results):
+def test_a_failing_planner_gets_no_scores(results):
     failed = one(results, "broken:Dies", "free")
     assert failed.reason == "planner failed"
     assert "KeyError" in failed.error
@@ -77,7 +77,7 @@ def test_a_planner_that_dies_gets_no_scores_and_holds_up_nobody(results):
     assert all(spread is None for spread in group.scores.values())
 
 
-def test_seeds_vary_a_case_and_the_same_for_every_planner(results):
+def test_a_seed_gives_the_same_variation_for_every_planner(results):
     speeds = {
         (d.policy, d.seed): [i.others.velocities[1].tolist() for i in d.recording.instants[:12]]
         for d in results
@@ -86,7 +86,7 @@ def test_seeds_vary_a_case_and_the_same_for_every_planner(results):
     assert speeds["idm", 0][:3] == speeds["pid", 0][:3]
 
 
-def test_the_page_holds_everything_and_loads_nothing(results):
+def test_the_html_report_is_self_contained(results):
     text = render_page(results, title="a < b")
     assert "a &lt; b" in text
     loaded = re.findall(r'(?:src|href)="([^"]*)"', text)
@@ -100,7 +100,7 @@ def test_the_page_holds_everything_and_loads_nothing(results):
 
 @pytest.fixture(scope="module")
 def evaluated(site, tmp_path_factory) -> tuple[Path, str]:
-    """The folder and output of `evaluate-policy` on a scene with three seeds."""
+    """Folder and output of `evaluate-policy` on a scene with three seeds."""
     out = tmp_path_factory.mktemp("evaluate") / "out"
     command = ["evaluate-policy", "--policy", "pid", "--scene", "tiny", "--seeds", "3"]
     done = CliRunner().invoke(build_app(), [*command, "--url", site.url, "--out", str(out)])
@@ -139,7 +139,7 @@ FAILURES = {
 }
 
 
-def test_planners_that_fail_are_told_and_the_rest_is_driven(site, tmp_path, monkeypatch):
+def test_failing_planners_are_reported_and_the_others_driven(site, tmp_path, monkeypatch):
     (tmp_path / "bad.py").write_text(BAD)
     monkeypatch.chdir(tmp_path)
     out = tmp_path / "out"
@@ -163,7 +163,7 @@ def test_planners_that_fail_are_told_and_the_rest_is_driven(site, tmp_path, monk
         assert client.sessions.list() == []
 
 
-def test_a_planner_that_failed_has_no_number_of_collisions(site, tmp_path, monkeypatch):
+def test_a_failed_planner_has_no_collision_count(site, tmp_path, monkeypatch):
     (tmp_path / "bad_too.py").write_text(BAD)
     monkeypatch.chdir(tmp_path)
     command = ["evaluate-policy", "--policy", "bad_too:Exits", "--scene", "tiny"]
@@ -172,7 +172,7 @@ def test_a_planner_that_failed_has_no_number_of_collisions(site, tmp_path, monke
     assert re.search("failed episodes *│ *1 of 1", done.output)
 
 
-def test_the_command_leaves_a_report_of_a_running_worker(evaluated):
+def test_the_command_writes_a_report(evaluated):
     out, output = evaluated
     figures = json.loads((out / "report.json").read_text())
     assert unconfirmed_scores(figures, out) == []
@@ -180,14 +180,14 @@ def test_the_command_leaves_a_report_of_a_running_worker(evaluated):
     assert "pid" in output
 
 
-def test_a_scene_is_driven_once_whatever_the_seeds_and_the_command_says_so(evaluated):
+def test_a_scene_without_randomness_is_driven_once_with_a_note(evaluated):
     out, output = evaluated
     figures = json.loads((out / "report.json").read_text())
     assert [(e["case"], e["seed"]) for e in figures["episodes"]] == [("tiny", 0)]
     assert "driven once, not with 3 seeds: tiny" in output
 
 
-def test_who_asks_for_no_seeds_is_not_told_of_them(site, tmp_path, monkeypatch):
+def test_without_seeds_the_output_does_not_mention_them(site, tmp_path, monkeypatch):
     (tmp_path / "bad_again.py").write_text(BAD)
     monkeypatch.chdir(tmp_path)
     command = ["evaluate-policy", "--policy", "bad_again:Early", "--scene", "tiny"]

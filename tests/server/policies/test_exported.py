@@ -1,4 +1,4 @@
-"""Examples of a policy from exported data sets."""
+"""Training examples from exported data sets."""
 
 from __future__ import annotations
 
@@ -35,25 +35,25 @@ def beside(tiny_scene, tmp_path_factory):
     return export_dataset(drive, PLAN, tmp_path_factory.mktemp("set") / "beside")
 
 
-def test_the_labelled_plan_is_what_is_taught(beside):
+def test_labelled_plans_are_the_training_targets(beside):
     found = exported_examples([beside], SHAPE)
     assert found.images.shape == (10, 3, 24, 32)
     assert found.poses.shape == (10, 2, 3)
-    # Half a second and a second at about 5 m/s, beside the path and back.
+    # Half a second and a second at about 5 m/s, off the path and back.
     assert found.poses[:, :, 0] * 20 == pytest.approx(np.tile([2.5, 5.0], (10, 1)), abs=0.2)
     assert np.abs(found.poses[:, 1, 1]).max() * 20 > 0.1
 
 
-def test_speed_and_command_are_those_of_the_frame(beside):
+def test_speed_and_command_are_read_from_the_frame(beside):
     states = exported_examples([beside], SHAPE).states
     assert states[:, 0] * 10 == pytest.approx(np.full(10, 5.0), abs=0.15)
     assert (states[:, 1:] == [0, 1, 0]).all()
 
 
-def test_the_route_is_told_as_in_a_session(beside):
+def test_the_exported_route_starts_at_the_next_waypoint(beside):
     frames = Clip.open(beside / "labels" / "0001").frames
     assert np.shape(frames[0]["ego"]["route"]) == (20, 2)
-    # Back on its path it has the next place 2 m ahead.
+    # Back on the path, the next waypoint is 2 m ahead.
     assert frames[-1]["ego"]["route"][0] == pytest.approx([2.0, 0.0], abs=0.15)
 
 
@@ -61,13 +61,13 @@ def test_every_fifth_frame_of_a_clip_is_held_out(beside):
     assert np.flatnonzero(exported_examples([beside], SHAPE).held_out).tolist() == [4, 9]
 
 
-def test_the_camera_that_looks_ahead_is_seen(beside):
+def test_the_front_camera_is_the_default(beside):
     assert exported_shape(beside, None).camera == "front"
     with pytest.raises(CommandError, match="no camera 'rear'"):
         exported_shape(beside, "rear")
 
 
-def test_an_export_too_short_for_its_plans_is_refused_by_the_command(beside, tmp_path):
+def test_an_export_too_short_for_the_plans_is_refused(beside, tmp_path):
     out = str(tmp_path / "policy.safetensors")
     done = CliRunner().invoke(build_app(), ["train-policy", str(beside), str(beside), "-o", out])
     assert done.exit_code == 1

@@ -1,4 +1,4 @@
-"""Workers for tests: in memory, by way of the ASGI interface."""
+"""Workers for tests, in memory through the ASGI interface."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ PROCESSORS = [
 
 @pytest.fixture
 def make_settings(tmp_path: Path, scenes_dir: Path) -> Callable[..., Settings]:
-    """Settings of a worker in the test's own folders; keywords override."""
+    """Settings of a worker in the test's own folders. Keyword arguments override them."""
 
     def make(**overrides) -> Settings:
         defaults = {
@@ -56,7 +56,7 @@ def make_settings(tmp_path: Path, scenes_dir: Path) -> Callable[..., Settings]:
 
 @pytest.fixture
 def run_worker(make_settings) -> Callable[..., TestClient]:
-    """Makes workers that run for the length of a ``with`` block; keywords override settings."""
+    """Create workers that run inside a ``with`` block. Keyword arguments override settings."""
     return lambda **overrides: TestClient(
         create_app(make_settings(**overrides)), base_url="http://127.0.0.1"
     )
@@ -64,7 +64,7 @@ def run_worker(make_settings) -> Callable[..., TestClient]:
 
 @pytest.fixture
 def start_worker(run_worker) -> Iterator[Callable[..., TestClient]]:
-    """Starts workers that stop with the test; keywords override settings."""
+    """Start workers that stop at the end of the test. Keyword arguments override settings."""
     with ExitStack() as stack:
 
         def start(**overrides) -> TestClient:
@@ -80,11 +80,11 @@ def client(start_worker) -> TestClient:
 
 @dataclass(frozen=True)
 class HeldVideos:
-    """Videos of workers in this process, which are not drawn before the test lets them.
+    """Holds back the video jobs of workers in this process.
 
     Attributes:
-        begun: one of them waits for its first frame.
-        released: set it to let them be drawn; they can be cancelled before.
+        begun: set once a video job waits for its first frame.
+        released: set it to let the videos be drawn. They can be cancelled before.
     """
 
     begun: threading.Event = field(default_factory=threading.Event)
@@ -109,7 +109,7 @@ def held_videos(monkeypatch) -> Iterator[HeldVideos]:
 
 @pytest.fixture
 def small_disk() -> Iterator[Path]:
-    """A file system of 4 MiB."""
+    """A 4 MiB file system."""
     if os.getuid() != 0 or shutil.which("mount") is None:
         pytest.skip("needs root, to mount a small file system")
     with tempfile.TemporaryDirectory(prefix="real2sim-disk-") as folder:
@@ -125,8 +125,8 @@ def small_disk() -> Iterator[Path]:
 
 @pytest.fixture(scope="session")
 def postgres() -> Iterator[Postgres]:
-    """A PostgreSQL server for the whole run; skips where there is none."""
-    # Not below pytest's own folder, which other users cannot enter.
+    """A PostgreSQL server for the whole run. Skips if PostgreSQL is not installed."""
+    # Outside pytest's own folder, which other users cannot enter.
     with (
         tempfile.TemporaryDirectory(prefix="real2sim-pg-") as folder,
         running_postgres(Path(folder)) as server,
@@ -136,7 +136,7 @@ def postgres() -> Iterator[Postgres]:
 
 @pytest.fixture(autouse=True, scope="session")
 def kernels(worker_kernels) -> None:
-    """Workers under test are ready at once."""
+    """Make workers under test ready at once."""
 
 
 @pytest.fixture(autouse=True, scope="session")
@@ -154,7 +154,7 @@ def logged() -> Iterator[list[dict[str, Any]]]:
 
 
 def _log_from(level: int) -> None:
-    # Tracebacks as a worker writes them: pretty ones print all variables, which takes seconds.
+    # Format tracebacks as a worker does. Pretty ones print all variables, which takes seconds.
     structlog.configure(
         processors=PROCESSORS, wrapper_class=structlog.make_filtering_bound_logger(level)
     )

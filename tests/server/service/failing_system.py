@@ -1,8 +1,8 @@
-"""A system that fails on demand below one folder, and whose clock can be set: for workers in
-processes of their own, without root.
+"""File system errors and clock shifts on demand, for workers in their own processes, without root.
 
-A small library stands before the system's: writes below the folder fail with the error number in a
-file, which may name only some paths; the wall clock is moved by the seconds in another file.
+A small preloaded library intercepts system calls. Writes below a folder fail with the error number
+in a file, which can limit the failure to some paths. A second file holds the offset of the wall
+clock in seconds.
 """
 
 from __future__ import annotations
@@ -147,11 +147,11 @@ int clock_gettime(clockid_t which, struct timespec *now) {
 
 @dataclass(frozen=True)
 class FailingSystem:
-    """What a worker is started with, and what it is to meet.
+    """Environment of a worker under test and the failures to inject.
 
     Attributes:
-        folder: below which writes may fail.
-        environment: of the worker's process.
+        folder: writes below it can fail.
+        environment: environment variables of the worker's process.
     """
 
     folder: Path
@@ -159,15 +159,15 @@ class FailingSystem:
 
     @contextlib.contextmanager
     def refusing_writes(self, number: int, *, to: str = "") -> Iterator[None]:
-        """Writes below the folder fail by this error number, for the length of the block.
+        """Make writes below the folder fail inside the block.
 
         Args:
-            number: of the error.
-            to: pattern of the paths below the folder that refuse, if not all; ``*`` matches
-                slashes too.
+            number: errno of the failure.
+            to: pattern of the paths below the folder that fail (default: all). ``*`` also matches
+                slashes.
         """
         switch = Path(self.environment["FAILING_ERRNO_FILE"])
-        # Put there whole: the worker reads it at any time.
+        # Write atomically: the worker can read the file at any time.
         written = switch.with_suffix(".new")
         written.write_text(f"{number} {self.folder / to if to else ''}\n")
         written.replace(switch)
@@ -177,7 +177,7 @@ class FailingSystem:
             switch.unlink()
 
     def set_clock(self, seconds: int) -> None:
-        """Move the wall clock of the worker."""
+        """Shift the wall clock of the worker."""
         offset = Path(self.environment["CLOCK_OFFSET_FILE"])
         written = offset.with_suffix(".new")
         written.write_text(str(seconds))
@@ -188,7 +188,7 @@ READ_ONLY, NO_SPACE, BROKEN = errno.EROFS, errno.ENOSPC, errno.EIO
 
 
 def failing_system(folder: Path, place: Path) -> FailingSystem:
-    """One for workers whose state is in ``folder``, made in ``place``; skips without a compiler."""
+    """A failing system for state in ``folder``, built in ``place``. Skips without a compiler."""
     compiler = shutil.which("cc")
     if compiler is None:
         pytest.skip("needs a C compiler")

@@ -1,4 +1,5 @@
-"""HAProxy before several workers, from the system's package, set up as ``docker/haproxy.cfg``."""
+"""HAProxy in front of several workers, from the system package, configured by
+``docker/haproxy.cfg``."""
 
 from __future__ import annotations
 
@@ -20,7 +21,7 @@ SHIPPED = Path(__file__).parents[3] / "docker" / "haproxy.cfg"
 
 
 def configuration(port: int, workers: Mapping[str, int], agents: Mapping[str, int]) -> str:
-    """The file that is shipped, for workers on ports of this machine."""
+    """The shipped configuration, for workers on local ports."""
     text = SHIPPED.read_text().partition("\nresolvers dns")[0]
     lines = [line for line in text.splitlines() if not line.startswith("  server ")]
     lines += [
@@ -33,7 +34,7 @@ def configuration(port: int, workers: Mapping[str, int], agents: Mapping[str, in
 
 
 def program() -> str:
-    """The program; skips where there is none."""
+    """Path of the HAProxy executable. Skips if HAProxy is not installed."""
     found = shutil.which("haproxy") or shutil.which("haproxy", path="/usr/sbin")
     if found is None:
         pytest.skip("there is no haproxy")
@@ -44,7 +45,7 @@ def program() -> str:
 def running_haproxy(
     folder: Path, workers: Mapping[str, int], agents: Mapping[str, int]
 ) -> Iterator[str]:
-    """A proxy before workers, by their names, ports and their agents' ports; its address."""
+    """Run a proxy for workers given by name, port and agent port. Yields its address."""
     haproxy, port = program(), reserved_port()
     file = folder / "haproxy.cfg"
     file.write_text(configuration(port, workers, agents))

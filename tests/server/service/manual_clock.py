@@ -1,4 +1,4 @@
-"""A clock that stands still until a test moves it, in place of the worker's."""
+"""A clock for workers that only advances when a test moves it."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from real2sim_server.service import clock
 from tests.waiting import wait_until
 
 SOON_S = 1.0
-"""What is due within this time is what a test waits for; a worker's own rounds come later."""
+"""Tests wait for sleepers due within this time [s]. Periodic work of a worker is due later."""
 
 
 class ManualClock:
     """Replaces the worker's monotonic time while a test runs.
 
-    Deadlines, wall-clock limits, idle time, rates and engine time pass only when the test calls
-    :meth:`advance` or :meth:`expire_next`, so they depend on no machine's speed.
+    Deadlines, wall-clock limits, idle times, rates and engine time only pass when the test calls
+    :meth:`advance` or :meth:`expire_next`. They do not depend on the speed of the machine.
     """
 
     def __init__(self) -> None:
@@ -44,7 +44,7 @@ class ManualClock:
                 self._sleepers.pop(due, None)
 
     def advance(self, seconds: float) -> None:
-        """Move on; whatever is due by then goes on."""
+        """Advance the clock and wake everything that is due."""
         with self._lock:
             self._now += seconds
             for future, at in list(self._sleepers.items()):
@@ -53,15 +53,15 @@ class ManualClock:
                     future.get_loop().call_soon_threadsafe(_wake, future)
 
     def wait_for_sleeper(self) -> float:
-        """Wait until something is due soon; returns in how many seconds [s]."""
+        """Wait until something is due soon. Returns the remaining time [s]."""
         return wait_until(self._next_due, "something that waits for the clock")
 
     def expire_next(self) -> None:
-        """Wait until something is due soon, and move on to that moment."""
+        """Wait until something is due soon, then advance to that moment."""
         self.advance(self.wait_for_sleeper())
 
     def release(self) -> None:
-        """Whatever waits goes on, so that workers that outlive the test do."""
+        """Wake all sleepers, so that workers that outlive the test continue."""
         with self._lock:
             for future in self._sleepers:
                 future.get_loop().call_soon_threadsafe(_wake, future)
@@ -69,7 +69,7 @@ class ManualClock:
 
     @property
     def anything_due(self) -> bool:
-        """Whether anything waits for a moment that is near."""
+        """Whether something is due soon."""
         return self._next_due() is not None
 
     def _next_due(self) -> float | None:
@@ -85,7 +85,7 @@ def _wake(future: asyncio.Future[None]) -> None:
 
 @pytest.fixture
 def manual_clock() -> Iterator[ManualClock]:
-    """The time of all workers of this process, moved by hand."""
+    """Manual clock for all workers of this process."""
     manual = ManualClock()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(clock, "monotonic", manual.monotonic)

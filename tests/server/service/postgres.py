@@ -1,4 +1,4 @@
-"""A PostgreSQL server of the test's own, from the system's package."""
+"""A local PostgreSQL server for tests, from the system package."""
 
 from __future__ import annotations
 
@@ -31,17 +31,17 @@ class Postgres:
     control: Callable[..., None]
 
     def start(self) -> None:
-        """Start it, or start it again."""
+        """Start or restart the server."""
         options = f"-p {self.port} -h 127.0.0.1 -k {self.data.parent} -F"
         self.control("-l", self.data.parent / "log", "-w", "-o", options, "start")
 
     def stop(self) -> None:
-        """Stop it at once; its connections break."""
+        """Stop the server immediately. Open connections break."""
         self.control("-m", "immediate", "stop")
 
     @contextmanager
     def frozen(self) -> Iterator[None]:
-        """Connections stay open, and nothing is answered, for the length of the block."""
+        """Freeze the server inside the block: connections stay open but get no answers."""
         server = int((self.data / "postmaster.pid").read_text().split()[0])
         listed = Path(f"/proc/{server}/task/{server}/children").read_text()
         processes = [server, *map(int, listed.split())]
@@ -69,7 +69,7 @@ class Postgres:
 
 @contextmanager
 def running_postgres(folder: Path) -> Iterator[Postgres]:
-    """A server in ``folder`` on a free port of this machine; skips where there is none."""
+    """Run a server in ``folder`` on a free local port. Skips if PostgreSQL is not installed."""
     programs = _programs()
     data = folder / "data"
     unprivileged: list[str] = []
@@ -81,7 +81,7 @@ def running_postgres(folder: Path) -> Iterator[Postgres]:
         unprivileged = ["runuser", "-u", "nobody", "--"]
 
     def call(*command: str | Path) -> None:
-        # Not in the folder of the tests, which other users may not be allowed to enter.
+        # Outside the test folders, which other users may not be able to enter.
         done = subprocess.run(
             [*unprivileged, *map(str, command)],
             capture_output=True,

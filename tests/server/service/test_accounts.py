@@ -1,4 +1,4 @@
-"""Named tokens: who takes how much, and where it ends."""
+"""Named tokens: limits, accounting and revocation."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ SINGLE = "a long enough secret"
 # --- limits -----------------------------------------------------------------------------------
 
 
-def test_a_meter_lets_a_second_at_once_and_then_as_much_as_leaks(manual_clock):
+def test_a_meter_allows_a_burst_of_one_second_then_refills(manual_clock):
     meter = Meter(10.0)
     assert [meter.take() for _ in range(10)] == [0.0] * 10
     assert meter.take() == pytest.approx(0.1)
@@ -41,7 +41,7 @@ def test_a_meter_lets_a_second_at_once_and_then_as_much_as_leaks(manual_clock):
     assert meter.take() == 0
 
 
-def test_a_meter_below_one_lets_one_at_a_time(manual_clock):
+def test_a_meter_below_one_per_second_allows_one_at_a_time(manual_clock):
     meter = Meter(0.5)
     assert meter.take() == 0
     assert meter.take() == pytest.approx(2.0)
@@ -49,7 +49,7 @@ def test_a_meter_below_one_lets_one_at_a_time(manual_clock):
     assert meter.take() == 0
 
 
-def test_who_has_had_enough_is_told_of_what(manual_clock):
+def test_an_account_over_its_limit_reports_which_limit(manual_clock):
     account = Account("alice", TokenLimits(requests_per_second=2))
     account.admit()
     account.admit()
@@ -60,7 +60,7 @@ def test_who_has_had_enough_is_told_of_what(manual_clock):
     assert (account.requests, account.refusals[Limit.REQUESTS]) == (2, 1)
 
 
-def test_other_limits_do_not_count_what_was_taken_before(manual_clock):
+def test_changed_limits_do_not_count_earlier_requests(manual_clock):
     account = Account("alice")
     for _ in range(9):
         account.admit()
@@ -71,7 +71,7 @@ def test_other_limits_do_not_count_what_was_taken_before(manual_clock):
 # --- the file ---------------------------------------------------------------------------------
 
 
-def test_the_file_holds_no_token_and_is_for_its_owner(tmp_path):
+def test_the_token_file_contains_no_token_and_is_private(tmp_path):
     path = tmp_path / "tokens.json"
     token = add_token(path, "alice", TokenLimits(sessions=2))
     assert token not in path.read_text()
@@ -93,14 +93,14 @@ def test_the_file_holds_no_token_and_is_for_its_owner(tmp_path):
         ("[" * 100_000, "JSON"),
     ],
 )
-def test_a_file_that_says_something_else_is_refused_with_the_reason(tmp_path, text, reason):
+def test_an_invalid_token_file_is_refused_with_the_reason(tmp_path, text, reason):
     path = tmp_path / "tokens.json"
     path.write_text(text)
     with pytest.raises(TokenFileError, match=reason):
         read_token_file(path)
 
 
-def test_names_are_given_once_and_removed_once(tmp_path):
+def test_duplicate_and_unknown_token_names_are_refused(tmp_path):
     path = tmp_path / "tokens.json"
     add_token(path, "alice", TokenLimits())
     with pytest.raises(TokenFileError, match="already"):
@@ -110,7 +110,7 @@ def test_names_are_given_once_and_removed_once(tmp_path):
         remove_token(path, "alice")
 
 
-def test_a_changed_file_counts_at_once_and_a_broken_one_changes_nothing(tmp_path):
+def test_a_reload_applies_a_valid_file_and_ignores_a_broken_one(tmp_path):
     path = tmp_path / "tokens.json"
     alice = add_token(path, "alice", TokenLimits())
     accounts = Accounts(token=SINGLE, file=path)
@@ -134,7 +134,7 @@ def test_a_changed_file_counts_at_once_and_a_broken_one_changes_nothing(tmp_path
     assert accounts.of_token(SINGLE).name == "default"
 
 
-# --- by REST ----------------------------------------------------------------------------------
+# --- REST ---------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -152,7 +152,7 @@ def figure(client, name: str, token: str) -> float:
     return float(found.group(1))
 
 
-def test_a_worker_with_named_tokens_wants_one(start_worker, tokens_file):
+def test_a_worker_with_named_tokens_requires_one(start_worker, tokens_file):
     alice = add_token(tokens_file, "alice", TokenLimits())
     client = start_worker(tokens_file=tokens_file)
     assert client.get("/v1/server").status_code == 401
@@ -160,21 +160,21 @@ def test_a_worker_with_named_tokens_wants_one(start_worker, tokens_file):
     assert client.get("/v1/server", headers=bearer(alice)).status_code == 200
 
 
-def test_what_each_token_takes_is_told_by_its_name(start_worker, tokens_file):
+def test_metrics_count_requests_and_sessions_per_token(start_worker, tokens_file):
     alice = add_token(tokens_file, "alice", TokenLimits())
     client = start_worker(token=SINGLE, tokens_file=tokens_file)
     for _ in range(3):
         client.get("/v1/scenes/tiny/render?width=64", headers=bearer(alice))
     made = client.post("/v1/sessions?scene=tiny", json={"reset": {}}, headers=bearer(alice)).json()
     assert made["owner"] == "alice"
-    # The session's own token is that of its owner.
+    # The session's own token counts for its owner.
     client.get(f"/v1/sessions/{made['session_id']}/state", headers=bearer(made["token"]))
     assert figure(client, "requests_total", "alice") == 5
     assert figure(client, "sessions", "alice") == 1
     assert figure(client, "sessions", "default") == 0
 
 
-def test_over_its_rate_a_token_gets_429_and_others_go_on(start_worker, tokens_file):
+def test_a_token_over_its_rate_gets_429_without_affecting_others(start_worker, tokens_file):
     alice = add_token(tokens_file, "alice", TokenLimits(requests_per_second=0.1))
     client = start_worker(token=SINGLE, tokens_file=tokens_file)
     assert client.get("/v1/server", headers=bearer(alice)).status_code == 200
@@ -188,7 +188,7 @@ def test_over_its_rate_a_token_gets_429_and_others_go_on(start_worker, tokens_fi
     assert 'real2sim_token_refusals_total{limit="requests",token="alice"} 1.0' in text
 
 
-def test_sessions_of_a_token_are_limited_forks_among_them(start_worker, tokens_file):
+def test_the_session_limit_of_a_token_includes_forks(start_worker, tokens_file):
     alice = add_token(tokens_file, "alice", TokenLimits(sessions=1))
     bob = add_token(tokens_file, "bob", TokenLimits())
     client = start_worker(tokens_file=tokens_file)
@@ -206,14 +206,14 @@ def test_sessions_of_a_token_are_limited_forks_among_them(start_worker, tokens_f
     assert client.post(url, headers=bearer(alice)).status_code == 201
 
 
-def test_jobs_keep_their_owner(start_worker, tokens_file):
+def test_a_job_has_the_owner_of_its_token(start_worker, tokens_file):
     alice = add_token(tokens_file, "alice", TokenLimits())
     client = start_worker(tokens_file=tokens_file)
     body = {"scene": "tiny", "camera": "front", "fps": 2, "width": 64}
     assert client.post("/v1/exports", json=body, headers=bearer(alice)).json()["owner"] == "alice"
 
 
-def test_keys_of_one_token_are_not_those_of_another(start_worker, tokens_file):
+def test_idempotency_keys_are_separate_per_token(start_worker, tokens_file):
     alice = add_token(tokens_file, "alice", TokenLimits())
     bob = add_token(tokens_file, "bob", TokenLimits())
     client = start_worker(tokens_file=tokens_file)
@@ -226,7 +226,7 @@ def test_keys_of_one_token_are_not_those_of_another(start_worker, tokens_file):
     assert made[0]["session_id"] == made[2]["session_id"] != made[1]["session_id"]
 
 
-def test_owners_outlive_the_worker(start_worker, run_worker, tokens_file):
+def test_session_owners_survive_a_worker_restart(start_worker, run_worker, tokens_file):
     alice = add_token(tokens_file, "alice", TokenLimits(sessions=1))
     with run_worker(tokens_file=tokens_file) as client:
         made = client.post(
@@ -261,10 +261,8 @@ def driving(client, made, **fields):
         yield drive
 
 
-def test_messages_of_the_drive_socket_count_and_are_refused_over_the_limit(
-    start_worker, tokens_file, manual_clock
-):
-    # The session, the hello and the reset are let in.
+def test_drive_messages_over_the_rate_limit_are_refused(start_worker, tokens_file, manual_clock):
+    # The session creation, the hello and the reset are within the limit.
     alice = add_token(tokens_file, "alice", TokenLimits(requests_per_second=3))
     client = start_worker(token=SINGLE, tokens_file=tokens_file)
     made = client.post("/v1/sessions?scene=tiny", headers=bearer(alice)).json()
@@ -283,7 +281,7 @@ def test_messages_of_the_drive_socket_count_and_are_refused_over_the_limit(
         assert answer(drive)["type"] == "obs"
 
 
-def test_who_holds_a_removed_token_is_disconnected_and_their_sessions_are_closed_to_them(
+def test_removing_a_token_disconnects_its_sockets_and_closes_its_sessions(
     start_worker, tokens_file, monkeypatch
 ):
     monkeypatch.setattr(accounts_module, "RELOAD_S", 0.05)
@@ -311,7 +309,7 @@ def test_who_holds_a_removed_token_is_disconnected_and_their_sessions_are_closed
     assert client.get(path, headers=bearer(SINGLE)).status_code == 200
 
 
-def test_the_view_socket_is_refused_over_the_limit(start_worker, tokens_file):
+def test_view_messages_over_the_rate_limit_are_refused(start_worker, tokens_file):
     alice = add_token(tokens_file, "alice", TokenLimits(requests_per_second=2))
     client = start_worker(tokens_file=tokens_file)
     made = client.post("/v1/scenarios", json={"scene": "tiny"}, headers=bearer(alice)).json()
@@ -328,7 +326,7 @@ def test_the_view_socket_is_refused_over_the_limit(start_worker, tokens_file):
 # --- the command ------------------------------------------------------------------------------
 
 
-def test_the_command_prints_a_token_once_that_a_worker_takes(tmp_path, start_worker, capsys):
+def test_the_token_command_adds_lists_and_removes_tokens(tmp_path, start_worker, capsys):
     from real2sim_server.cli import store as command
 
     path = tmp_path / "tokens.json"

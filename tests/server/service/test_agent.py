@@ -1,4 +1,4 @@
-"""What a worker tells its proxy, and how it leaves a fleet in order."""
+"""What a worker reports to its proxy, and how it leaves a fleet."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from .waiting import succeeded
         (False, True, True, "down"),
     ],
 )
-def test_the_word_for_the_proxy(ready, full, handed_over, word):
+def test_the_agent_reports_the_state_for_the_proxy(ready, full, handed_over, word):
     found = Willingness(ready=ready, full=full, handed_over=handed_over)
     assert Agent(lambda: found, weight=70).word() == word
 
@@ -37,7 +37,7 @@ def ask(port: int) -> str:
 
 
 @pytest.mark.network
-def test_a_worker_tells_its_proxy_whether_it_takes_sessions(start):  # noqa: F811
+def test_a_worker_reports_to_the_proxy_whether_it_takes_sessions(start):  # noqa: F811
     port = reserved_port()
     client = start("w0", agent_port=port, max_sessions=1)
     wait_until(lambda: ask(port) == "up ready 100%\n", "the worker to be ready")
@@ -46,14 +46,14 @@ def test_a_worker_tells_its_proxy_whether_it_takes_sessions(start):  # noqa: F81
 
 
 def ready(client):
-    """The same, once others know that it takes work."""
+    """Wait until a worker is ready and other workers know it."""
     worker = client.app.state.worker
     wait_until(lambda: worker.readiness().ready, "the worker to be ready")
     tell(client)
     return client
 
 
-def test_sessions_are_handed_over_without_waiting_for_a_lease(start):  # noqa: F811
+def test_sessions_are_handed_over_before_the_lease_expires(start):  # noqa: F811
     first = start("w0")
     site = Site(first)
     assert site.step().status_code == 200
@@ -65,11 +65,11 @@ def test_sessions_are_handed_over_without_waiting_for_a_lease(start):  # noqa: F
     assert first.portal.call(worker.hand_over)
     assert worker._willingness().handed_over
     assert other.step().json()["step"] == 2
-    # Who still comes here is sent away, and nothing is taken back.
+    # Requests to the old worker are redirected, and it does not take the session back.
     assert site.step().json()["code"] == "SESSION_ELSEWHERE"
 
 
-def test_jobs_are_handed_over_too_and_nobody_has_died(start, held_videos):  # noqa: F811
+def test_jobs_are_handed_over_without_counting_a_worker_death(start, held_videos):  # noqa: F811
     first, second = start("w0"), ready(start("w1"))
     body = {"scene": "tiny", "camera": "front", "width": 64, "fps": 1}
     job = first.post("/v1/exports", json=body).headers["Location"]
@@ -80,14 +80,14 @@ def test_jobs_are_handed_over_too_and_nobody_has_died(start, held_videos):  # no
     assert (done["worker"], done["attempt"]) == ("w1", 1)
 
 
-def test_a_worker_without_others_keeps_its_sessions(start):  # noqa: F811
+def test_a_single_worker_does_not_hand_over_its_sessions(start):  # noqa: F811
     client = start("w0")
     site = Site(client)
     assert not client.portal.call(client.app.state.worker.hand_over)
     assert site.step().status_code == 200
 
 
-def test_a_server_that_is_told_to_stop_hands_over_before_it_ends(start, monkeypatch):  # noqa: F811
+def test_a_stopping_server_hands_over_before_it_exits(start, monkeypatch):  # noqa: F811
     first, second = start("w0"), ready(start("w1"))
     site = Site(first)
     server = serve.DrainingServer(
@@ -117,12 +117,12 @@ def test_a_hot_scene_is_loaded_by_one_more_worker():
     loads = {name: loads_of(name, [hot, *rest], hot=4) for name in ("w0", "w1", "w2", "w3", "w4")}
     assert sorted(loads.values()) == [[], [], [], [], ["a"]]
     assert loads["w1"] or loads["w2"]
-    # Two have it then, and nobody else loads it.
+    # Two workers have the scene now, so no other loads it.
     again = [hot, member("w1", scenes=["a"]), member("w2", scenes=["a", "b"])]
     assert [loads_of(name, again, hot=4) for name in ("w0", "w1", "w2")] == [[], [], []]
 
 
-def test_a_worker_loads_a_hot_scene_ahead(start, monkeypatch):  # noqa: F811
+def test_a_worker_preloads_a_hot_scene(start, monkeypatch):  # noqa: F811
     monkeypatch.setattr(membership, "LOOK_S", 0.05)
     first, second = start("w0", hot_scene_sessions=1), start("w1", hot_scene_sessions=1)
     Site(first)

@@ -1,6 +1,6 @@
-"""What was tried on a worker's sockets from outside, each with the answer that it gets now.
+"""Attacks on a worker's sockets from outside.
 
-Attacks on readers, imports and the store are tested beside those.
+Attacks on readers, imports and the store are tested with those.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ BEARER = {"Authorization": f"Bearer {TOKEN}"}
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory, tiny_scene) -> Iterator[RunningWorker]:
-    """A worker with a token on a real socket, whose connections may wait for long."""
+    """A worker with a token on a real socket. Its connections may stay idle for long."""
     root = tmp_path_factory.mktemp("attacked")
     save_scene(tiny_scene, root / "scenes" / "tiny.r2s")
     settings = Settings(
@@ -69,7 +69,7 @@ def opened(url: str) -> socket.socket:
 
 
 def read_to_end(connection: socket.socket) -> bytes:
-    """Everything until the worker closes; fails when it does not."""
+    """Read until the worker closes the connection. Fails if it does not."""
     received = b""
     with contextlib.suppress(ConnectionResetError):
         while data := connection.recv(65536):
@@ -84,7 +84,7 @@ def status_of(answer: bytes) -> int:
 # --- metrics ----------------------------------------------------------------------------------
 
 
-def test_methods_that_nobody_knows_are_one_label(client):
+def test_unknown_methods_share_one_metric_label(client):
     for k in range(20):
         client.request(f"METHOD{k}", "/v1/server")
     text = client.get("/metrics").text
@@ -92,7 +92,7 @@ def test_methods_that_nobody_knows_are_one_label(client):
     assert "METHOD" not in text
 
 
-def test_paths_that_nobody_knows_are_one_label(client):
+def test_unknown_paths_do_not_appear_in_metrics(client):
     client.get("/v1/secret-of-somebody")
     assert "secret-of-somebody" not in client.get("/metrics").text
 
@@ -110,11 +110,11 @@ def test_metrics_are_written_on_another_thread(client, monkeypatch):
     assert threads != [asking]
 
 
-# --- connections that wait --------------------------------------------------------------------
+# --- idle and slow connections -----------------------------------------------------------------
 
 
 class Received:
-    """A client's connection as the worker has it."""
+    """The worker's side of a client connection."""
 
     def __init__(self, site: RunningWorker, connection: socket.socket, monkeypatch: Any) -> None:
         self._connections, self._client = site.worker.connections, connection.getsockname()
@@ -126,24 +126,24 @@ class Received:
         return next((c for c in open_now if c.client == self._client), None)
 
     def wait_received(self, size: int) -> None:
-        """Return once the worker has so many bytes of the request."""
+        """Wait until the worker has received this many bytes of the request."""
         wait_until(lambda: self.protocol.received == size, f"{size} bytes to arrive")
 
     def time_out(self) -> None:
-        """Nothing is waited for any more."""
+        """Let all timeouts of the connection expire."""
         hasty = replace(self._connections.limits, head_s=0.0, body_s=0.0)
         self._monkeypatch.setattr(self._connections, "limits", hasty)
 
 
 @pytest.mark.network
-def test_a_silent_connection_is_closed(site, monkeypatch):
+def test_an_idle_connection_is_closed(site, monkeypatch):
     with opened(site.url) as connection:
         Received(site, connection, monkeypatch).time_out()
         assert read_to_end(connection) == b""
 
 
 @pytest.mark.network
-def test_headers_that_never_end_are_answered_and_closed_also_where_they_trickle(site, monkeypatch):
+def test_incomplete_headers_time_out_even_if_bytes_trickle_in(site, monkeypatch):
     head = b"GET /livez HTTP/1.1\r\nHost: 127.0.0.1\r\nX-Slow: "
     with opened(site.url) as connection:
         received, began = Received(site, connection, monkeypatch), set()
@@ -159,7 +159,7 @@ def test_headers_that_never_end_are_answered_and_closed_also_where_they_trickle(
 
 
 @pytest.mark.network
-def test_a_body_that_never_comes_is_answered_and_closed(site, monkeypatch):
+def test_an_incomplete_body_times_out(site, monkeypatch):
     head = (
         f"POST /v1/scenarios HTTP/1.1\r\nHost: 127.0.0.1\r\nAuthorization: Bearer {TOKEN}\r\n"
         "Content-Type: application/json\r\nContent-Length: 100\r\n\r\n{"
@@ -175,7 +175,7 @@ def test_a_body_that_never_comes_is_answered_and_closed(site, monkeypatch):
 
 
 @pytest.mark.network
-def test_a_second_request_that_stays_half_sent_is_closed(site, monkeypatch):
+def test_an_incomplete_second_request_times_out(site, monkeypatch):
     with opened(site.url) as connection:
         received = Received(site, connection, monkeypatch)
         connection.sendall(b"GET /livez HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\nGET /li")
@@ -190,14 +190,14 @@ def test_a_second_request_that_stays_half_sent_is_closed(site, monkeypatch):
 
 @pytest.fixture
 def hasty(site, monkeypatch) -> RunningWorker:
-    """The same worker; who reads nothing for half a second is given up."""
+    """A worker that drops clients that read nothing for half a second."""
     connections = site.worker.connections
     monkeypatch.setattr(connections, "limits", replace(connections.limits, write_s=0.5))
     return site
 
 
 @pytest.mark.network
-def test_a_client_that_never_reads_is_given_up(hasty):
+def test_an_http_client_that_never_reads_is_dropped(hasty):
     request = b"GET /openapi.json HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
     before = dropped(hasty, "write_timeout")
     with opened(hasty.url) as connection:
@@ -208,7 +208,7 @@ def test_a_client_that_never_reads_is_given_up(hasty):
 
 
 @pytest.mark.network
-def test_a_driver_that_never_reads_is_given_up(hasty):
+def test_a_drive_client_that_never_reads_is_dropped(hasty):
     before = dropped(hasty, "write_timeout")
     info = create_session(hasty)
     render = {"v": 1, "type": "render", "sensors": [{"camera": "front", "codec": "raw"}]}
@@ -230,7 +230,7 @@ def test_bytes_that_are_not_http_get_a_problem_document(site):
 
 
 @pytest.mark.network
-def test_a_handshake_of_another_websocket_version_gets_a_problem_document(site):
+def test_an_unsupported_websocket_version_gets_a_problem_document(site):
     request = (
         "GET /v1/scenarios/any/view HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\n"
         "Connection: Upgrade\r\nSec-WebSocket-Version: 8\r\n"
@@ -249,7 +249,7 @@ def dropped(site: RunningWorker, reason: str) -> float:
 
 
 @pytest.mark.network
-def test_silent_connections_make_room_for_those_who_ask(site):
+def test_idle_connections_are_closed_to_make_room_for_requests(site):
     before = dropped(site, "crowded_out")
     with contextlib.ExitStack() as stack:
         for _ in range(30):
@@ -259,7 +259,7 @@ def test_silent_connections_make_room_for_those_who_ask(site):
 
 
 @pytest.mark.network
-def test_sockets_stay_when_silent_connections_crowd(site):
+def test_open_sockets_survive_a_crowd_of_idle_connections(site):
     info = create_session(site)
     with joined(info) as drive, contextlib.ExitStack() as stack:
         for _ in range(30):
@@ -269,7 +269,7 @@ def test_sockets_stay_when_silent_connections_crowd(site):
 
 
 @pytest.mark.network
-def test_where_all_connections_work_another_is_refused_with_503(make_settings, kernels):
+def test_a_connection_over_the_limit_is_refused_if_none_is_idle(make_settings, kernels):
     with running_worker(make_settings(max_connections=2)) as running:
         url = f"{running.url}/v1/sessions?scene=tiny"
         info = httpx2.post(url, headers={"Connection": "close"}, timeout=LIMIT_S).json()
@@ -280,7 +280,7 @@ def test_where_all_connections_work_another_is_refused_with_503(make_settings, k
 
 
 @pytest.mark.network
-def test_a_thousand_silent_and_half_open_connections_lock_nobody_out(tmp_path, tiny_scene):
+def test_a_thousand_idle_and_half_open_connections_block_no_client(tmp_path, tiny_scene):
     wanted = 1000
     allow_descriptors(wanted + 200)
     save_scene(tiny_scene, tmp_path / "scenes" / "tiny.r2s")
@@ -319,7 +319,7 @@ def allow_descriptors(count: int) -> None:
 
 @contextlib.contextmanager
 def worker_process(folder: Path, *, descriptors: int) -> Iterator[tuple[str, Path]]:
-    """A worker of its own: its address and its log."""
+    """A worker in its own process. Yields its address and its log."""
     limit = f"({descriptors}, {descriptors})"
     log_file = folder / "worker.log"
     process = start_real2sim(
@@ -349,7 +349,7 @@ def create_session(site: RunningWorker) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def joined(info: dict[str, Any], *, role: str = "controller", **options: Any) -> Iterator[Any]:
-    """A drive socket behind its welcome."""
+    """A drive socket after its welcome."""
     with connect(
         info["ws_url"], subprotocols=[DRIVE_SUBPROTOCOL], compression=None, proxy=None, **options
     ) as drive:
@@ -387,7 +387,7 @@ FIRST_MESSAGES: dict[str, Callable[[Any], None]] = {
 
 
 @pytest.mark.parametrize("first", FIRST_MESSAGES)
-def test_a_first_message_that_is_no_hello_closes_the_view(start_worker, logged, first):
+def test_a_first_message_other_than_hello_closes_the_view(start_worker, logged, first):
     client = start_worker(token=TOKEN)
     with view(client) as socket:
         FIRST_MESSAGES[first](socket)
@@ -395,7 +395,7 @@ def test_a_first_message_that_is_no_hello_closes_the_view(start_worker, logged, 
     assert not any("exc_info" in entry for entry in logged)
 
 
-def test_a_view_without_a_hello_is_closed_in_time(start_worker, monkeypatch):
+def test_a_view_without_a_hello_times_out(start_worker, monkeypatch):
     monkeypatch.setattr(view_route, "HANDSHAKE_TIMEOUT_S", 0.1)
     with view(start_worker(token=TOKEN)) as socket:
         assert close_code(socket) == 4408
@@ -404,7 +404,7 @@ def test_a_view_without_a_hello_is_closed_in_time(start_worker, monkeypatch):
 @pytest.mark.parametrize(
     "message", [b"\x00", NESTED, '{"camera": "\\ud800", "t_us": 0}', '{"camera": "x", "t_us": NaN}']
 )
-def test_a_bad_question_is_refused_and_the_view_goes_on(client, message):
+def test_an_invalid_view_request_is_refused_and_the_view_stays_open(client, message):
     made = client.post("/v1/scenarios", json={"scene": "tiny"}).json()
     with view(client, made["scenario_id"]) as socket:
         socket.send_json({"type": "hello"})
@@ -417,7 +417,7 @@ def test_a_bad_question_is_refused_and_the_view_goes_on(client, message):
             assert socket.receive_json()["type"] == "error"
 
 
-def test_the_reason_of_a_close_fits_its_frame(client):
+def test_a_close_reason_is_cut_to_the_frame_limit(client):
     name = "%C3%A9" * 90
     with view(client, name) as socket:
         socket.send_json({"type": "hello"})
@@ -442,7 +442,7 @@ def test_the_reason_of_a_close_fits_its_frame(client):
         encode({"type": "hello", "id": np.zeros(2)}),
     ],
 )
-def test_a_first_message_that_is_no_hello_closes_the_drive_socket(site, data):
+def test_a_first_message_other_than_hello_closes_the_drive_socket(site, data):
     info = create_session(site)
     with connect(
         info["ws_url"], subprotocols=[DRIVE_SUBPROTOCOL], compression=None, proxy=None
@@ -456,7 +456,7 @@ def test_a_first_message_that_is_no_hello_closes_the_drive_socket(site, data):
 
 @pytest.mark.network
 @pytest.mark.parametrize("version", [np.ones(3), np.zeros(0), [1], "1", 1.0, True, 2])
-def test_a_message_of_no_version_of_ours_is_told_so(site, logged, version):
+def test_a_message_of_an_unknown_version_is_refused(site, logged, version):
     info = create_session(site)
     with joined(info) as drive:
         drive.send(encode({"v": version, "type": "bye", "id": 7}))
@@ -467,7 +467,7 @@ def test_a_message_of_no_version_of_ours_is_told_so(site, logged, version):
 
 @pytest.mark.network
 @pytest.mark.parametrize("text", [b"\xff\xfe", b"\xed\xa0\x80", b"\xf0\x9f"])
-def test_text_that_is_no_utf8_closes_the_socket_and_leaves_no_traceback(site, caplog, text):
+def test_invalid_utf8_closes_the_socket_without_a_traceback(site, caplog, text):
     with connect(
         create_session(site)["ws_url"],
         subprotocols=[DRIVE_SUBPROTOCOL],
@@ -484,7 +484,7 @@ def test_text_that_is_no_utf8_closes_the_socket_and_leaves_no_traceback(site, ca
 
 @pytest.mark.network
 @pytest.mark.parametrize("last", [b"\x83\x80\0\0\0\0", b"\x81\x82\0\0\0\0\xff\xfe", b""])
-def test_a_view_whose_client_leaves_while_its_hello_is_refused_leaves_no_error(
+def test_a_client_that_leaves_during_a_refused_view_hello_logs_no_error(
     site, caplog, monkeypatch, last
 ):
     async def refuse_late(*_arguments: Any) -> None:
@@ -512,7 +512,7 @@ def test_a_view_whose_client_leaves_while_its_hello_is_refused_leaves_no_error(
 
 
 @pytest.mark.network
-def test_handshakes_that_are_refused_leave_no_error(site, caplog):
+def test_refused_handshakes_log_no_error(site, caplog):
     path = create_session(site)["ws_url"].split("/", 3)[3]
     request = (
         f"GET /{path} HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\n"
@@ -527,7 +527,7 @@ def test_handshakes_that_are_refused_leave_no_error(site, caplog):
 
 
 @pytest.mark.network
-def test_a_drive_socket_without_a_hello_is_closed_in_time(site, monkeypatch):
+def test_a_drive_socket_without_a_hello_times_out(site, monkeypatch):
     monkeypatch.setattr(messages, "HANDSHAKE_TIMEOUT_S", 0.1)
     info = create_session(site)
     with connect(
@@ -536,7 +536,7 @@ def test_a_drive_socket_without_a_hello_is_closed_in_time(site, monkeypatch):
         assert b"TIMEOUT" in drive.recv(timeout=LIMIT_S, decode=False)
 
 
-# --- pages of other sites ---------------------------------------------------------------------
+# --- cross-origin requests ----------------------------------------------------------------------
 
 FOREIGN = [
     {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "no-cors", "Sec-Fetch-Dest": "image"},
@@ -551,7 +551,7 @@ FOREIGN = [
 
 @pytest.mark.parametrize("headers", FOREIGN)
 @pytest.mark.parametrize("token", [None, TOKEN])
-def test_pages_of_other_sites_and_ports_are_refused(start_worker, headers, token):
+def test_cross_origin_requests_are_refused(start_worker, headers, token):
     client = start_worker(token=token)
     auth = BEARER if token else {}
     for method, path in (("GET", "/v1/scenes/tiny/render"), ("POST", "/v1/scenarios")):
@@ -567,34 +567,34 @@ def test_pages_of_other_sites_and_ports_are_refused(start_worker, headers, token
         {"Sec-Fetch-Site": "none"},
     ],
 )
-def test_our_own_pages_and_programs_may_call(client, headers):
+def test_same_origin_pages_and_programs_are_allowed(client, headers):
     assert client.get("/v1/server", headers=headers).status_code == 200
 
 
-def test_a_link_from_elsewhere_leads_to_the_studio_and_no_frame_does(client):
+def test_the_studio_can_be_linked_but_not_framed_by_other_sites(client):
     link = {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "navigate"}
     assert client.get("/ui/", headers=link | {"Sec-Fetch-Dest": "document"}).status_code == 200
     assert client.get("/ui/", headers=link | {"Sec-Fetch-Dest": "iframe"}).status_code == 403
 
 
-# --- headers of answers -----------------------------------------------------------------------
+# --- response headers ---------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     "path", ["/livez", "/v1/server", "/v1/nothing", "/ui/", "/docs", "/v1/scenes/tiny/render", "/"]
 )
-def test_every_answer_tells_browsers_not_to_guess_embed_or_run(client, path):
+def test_every_response_has_security_headers(client, path):
     headers = client.get(path, follow_redirects=False).headers
     assert "default-src 'none'" in headers["Content-Security-Policy"]
     policy = headers["Content-Security-Policy"]
-    # The studio alone compiles WebAssembly, that of its vendored renderer; no page runs text.
+    # Only the studio compiles WebAssembly (its vendored renderer). No page evaluates text as code.
     allowed = {"'wasm-unsafe-eval'"} if path == "/ui/" else set()
     assert {word.strip(";") for word in policy.split() if "unsafe" in word} == allowed
     assert headers["X-Content-Type-Options"] == "nosniff"
     assert headers["Cross-Origin-Resource-Policy"] == "same-origin"
 
 
-def test_no_inline_script_runs_in_the_studio_but_its_map_of_modules(client):
+def test_the_import_map_is_the_only_inline_script_of_the_studio(client):
     page = client.get("/ui/")
     policy = page.headers["Content-Security-Policy"]
     (sources,) = [d for d in policy.split("; ") if d.startswith("script-src ")]
@@ -608,7 +608,7 @@ def test_no_inline_script_runs_in_the_studio_but_its_map_of_modules(client):
         assert "immutable" in answer.headers["Cache-Control"]
 
 
-def test_the_reference_of_calls_runs_no_script_and_needs_nobody_else(client):
+def test_the_api_reference_has_no_scripts_or_external_links(client):
     answer = client.get("/docs")
     assert answer.headers["content-type"].startswith("text/html")
     assert "<script" not in answer.text
@@ -621,7 +621,7 @@ def test_the_reference_of_calls_runs_no_script_and_needs_nobody_else(client):
 # --- tokens -----------------------------------------------------------------------------------
 
 
-def test_no_call_reads_a_body_before_its_token(start_worker):
+def test_every_call_checks_the_token_before_the_body(start_worker):
     client = start_worker(token=TOKEN)
     asked = []
     for path, item in client.get("/openapi.json").json()["paths"].items():
@@ -637,7 +637,7 @@ def test_no_call_reads_a_body_before_its_token(start_worker):
     assert len(asked) > 30
 
 
-def test_a_session_out_of_memory_is_not_rebuilt_for_strangers(start_worker, monkeypatch):
+def test_an_evicted_session_is_not_rebuilt_for_a_wrong_token(start_worker, monkeypatch):
     client = start_worker(token=TOKEN)
     info = client.post("/v1/sessions?scene=tiny", headers=BEARER).json()
     sessions = client.app.state.worker.sessions
@@ -654,7 +654,7 @@ def test_a_session_out_of_memory_is_not_rebuilt_for_strangers(start_worker, monk
     assert len(sessions) == 0
 
 
-def test_failed_tokens_are_counted(start_worker):
+def test_failed_authentications_are_counted(start_worker):
     client = start_worker(token=TOKEN)
     client.get("/v1/server")
     text = client.get("/metrics", headers=BEARER).text
@@ -673,22 +673,22 @@ def test_failed_tokens_are_counted(start_worker):
         ("/v1/sessions", "PATCH", "GET, HEAD, POST"),
     ],
 )
-def test_allow_names_all_methods(client, path, method, allowed):
+def test_the_allow_header_lists_all_methods(client, path, method, allowed):
     answer = client.request(method, path)
     assert (answer.status_code, answer.headers["Allow"]) == (405, allowed)
 
 
 @pytest.mark.parametrize("path", ["/livez", "/readyz", "/v1/server", "/v1/scenes/tiny/render"])
-def test_head_is_answered_like_get_without_its_body(client, path):
+def test_head_equals_get_without_a_body(client, path):
     client.get("/v1/scenes/tiny/render")
-    wait_ready(client)  # Warming up answers otherwise a moment later.
+    wait_ready(client)  # The response can change while the worker warms up.
     get, head = client.get(path), client.head(path)
     assert head.status_code == get.status_code
     assert head.headers["Content-Type"] == get.headers["Content-Type"]
     assert head.content == b""
 
 
-def test_routes_are_built_before_anything_else_runs(make_settings, monkeypatch):
+def test_routes_are_built_before_the_worker_starts(make_settings, monkeypatch):
     from fastapi.routing import _IncludedRouter
 
     from real2sim_server.service.app import create_app
@@ -702,7 +702,7 @@ def test_routes_are_built_before_anything_else_runs(make_settings, monkeypatch):
         return running(self)
 
     routers = [route for route in app.routes if isinstance(route, _IncludedRouter)]
-    for router in routers:  # Another application of this process may have built them.
+    for router in routers:  # Another application of this process may have built them already.
         router._effective_candidates_version = None
     monkeypatch.setattr(Worker, "running", noted)
     from fastapi.testclient import TestClient

@@ -36,7 +36,7 @@ def make_engine():
 
 
 class Gate:
-    """A job that occupies the engine until it is opened."""
+    """A job that blocks the engine until it is opened."""
 
     def __init__(self) -> None:
         self.entered = threading.Event()
@@ -61,11 +61,11 @@ def test_a_call_returns_what_the_function_returns(make_engine):
     assert engine.call_sync(int, "ff", base=16) == 255
 
 
-def test_an_engine_goes_on_when_the_loop_that_asked_is_gone(make_engine):
+def test_an_engine_survives_the_end_of_the_calling_event_loop(make_engine):
     engine, gate = make_engine(), Gate()
 
     async def ask_and_leave() -> None:
-        # Held by nobody else, and never cancelled, as when a loop is stopped at once.
+        # No other reference, and never cancelled, as when a loop is stopped abruptly.
         asyncio.ensure_future(engine.call(gate.job))  # noqa: RUF006
         await until_entered(gate)
 
@@ -76,7 +76,7 @@ def test_an_engine_goes_on_when_the_loop_that_asked_is_gone(make_engine):
     assert engine.call_sync(int, "7") == 7
 
 
-def test_all_jobs_run_on_the_same_thread_and_none_on_the_callers(make_engine):
+def test_all_jobs_run_on_one_thread_other_than_the_callers(make_engine):
     engine = make_engine()
 
     async def ask() -> list[int]:
@@ -87,7 +87,7 @@ def test_all_jobs_run_on_the_same_thread_and_none_on_the_callers(make_engine):
     assert threading.get_ident() not in idents
 
 
-def test_jobs_run_in_the_order_they_came(make_engine):
+def test_jobs_run_in_submission_order(make_engine):
     engine = make_engine()
     order: list[int] = []
 
@@ -98,14 +98,14 @@ def test_jobs_run_in_the_order_they_came(make_engine):
     assert order == list(range(50))
 
 
-def test_exceptions_travel_to_the_caller_and_the_engine_goes_on(make_engine):
+def test_an_exception_reaches_the_caller_and_the_engine_continues(make_engine):
     engine = make_engine()
     with pytest.raises(ZeroDivisionError):
         asyncio.run(engine.call(divmod, 1, 0))
     assert engine.call_sync(abs, -1) == 1
 
 
-def test_a_cancelled_caller_takes_the_waiting_job_along(make_engine):
+def test_cancelling_a_caller_removes_its_waiting_job(make_engine):
     engine, gate, ran = make_engine(), Gate(), []
 
     async def ask() -> None:
@@ -126,7 +126,7 @@ def test_a_cancelled_caller_takes_the_waiting_job_along(make_engine):
     assert ran == ["third"]
 
 
-def test_a_running_job_finishes_although_its_caller_was_cancelled(make_engine):
+def test_a_running_job_finishes_after_its_caller_was_cancelled(make_engine):
     engine, gate, ran = make_engine(), Gate(), []
 
     def job() -> None:
@@ -146,7 +146,7 @@ def test_a_running_job_finishes_although_its_caller_was_cancelled(make_engine):
     assert ran == ["finished"]
 
 
-def test_a_full_queue_refuses_at_once_and_names_the_limit(make_engine):
+def test_a_full_queue_refuses_immediately_with_the_limit(make_engine):
     engine, gate = make_engine(queue_length=2), Gate()
 
     async def ask() -> None:
@@ -163,7 +163,7 @@ def test_a_full_queue_refuses_at_once_and_names_the_limit(make_engine):
     asyncio.run(ask())
 
 
-def test_stop_finishes_what_waits(make_engine):
+def test_stop_finishes_waiting_jobs(make_engine):
     engine, gate = make_engine(), Gate()
 
     async def ask() -> list[object]:
@@ -180,7 +180,7 @@ def test_stop_finishes_what_waits(make_engine):
     assert not engine.alive
 
 
-def test_stop_without_draining_refuses_what_waits(make_engine):
+def test_stop_without_draining_refuses_waiting_jobs(make_engine):
     engine, gate = make_engine(), Gate()
 
     async def ask() -> None:
@@ -205,7 +205,7 @@ def test_a_stopped_engine_refuses_jobs(make_engine):
         engine.call_sync(lambda: None)
 
 
-def test_stop_says_which_job_does_not_end(make_engine):
+def test_a_stop_timeout_names_the_running_job(make_engine):
     engine, gate = make_engine(), Gate()
     caller = threading.Thread(target=engine.call_sync, args=(gate.job,), kwargs={"label": "slow"})
     caller.start()
@@ -216,12 +216,12 @@ def test_stop_says_which_job_does_not_end(make_engine):
     caller.join(LIMIT_S)
 
 
-def test_a_job_may_call_the_engine_without_waiting_for_itself(make_engine):
+def test_a_job_can_call_the_engine_recursively(make_engine):
     engine = make_engine()
     assert engine.call_sync(lambda: engine.call_sync(lambda: "inner")) == "inner"
 
 
-def test_call_sync_gives_up_after_its_timeout(make_engine):
+def test_call_sync_times_out(make_engine):
     engine, gate = make_engine(), Gate()
     with pytest.raises(TimeoutError):
         engine.call_sync(gate.job, timeout_s=0.05)
@@ -245,7 +245,7 @@ def test_the_heartbeat_ages_only_while_a_job_runs(make_engine, manual_clock):
     asyncio.run(ask())
 
 
-def test_a_sticky_device_error_ends_the_engine_and_refuses_all_others(make_engine):
+def test_a_sticky_device_error_stops_the_engine_and_fails_all_jobs(make_engine):
     engine, gate, told = make_engine(), Gate(), []
     engine.on_failure = lambda: told.append(True)
 
@@ -271,7 +271,7 @@ def test_a_sticky_device_error_ends_the_engine_and_refuses_all_others(make_engin
     assert not engine.alive
 
 
-def test_running_out_of_device_memory_does_not_end_the_engine(make_engine):
+def test_running_out_of_device_memory_does_not_stop_the_engine(make_engine):
     engine = make_engine()
 
     def allocate() -> None:
@@ -282,7 +282,7 @@ def test_running_out_of_device_memory_does_not_end_the_engine(make_engine):
     assert engine.alive
 
 
-def test_jobs_are_reported_with_their_label_and_durations():
+def test_jobs_are_reported_with_label_and_durations():
     reports: list[tuple[str, float, float]] = []
     engine = Engine(on_job=lambda *report: reports.append(report))
     engine.start()
@@ -294,7 +294,7 @@ def test_jobs_are_reported_with_their_label_and_durations():
     assert waited >= 0
 
 
-def test_a_long_job_gives_way_to_a_step_between_its_pieces(make_engine):
+def test_a_long_job_yields_to_a_drive_step(make_engine):
     engine, order = make_engine(), []
     piece, asked = threading.Event(), threading.Event()
 
@@ -320,7 +320,7 @@ def test_a_long_job_gives_way_to_a_step_between_its_pieces(make_engine):
     assert order == ["film begins", "DRIVE", "film ends", "BULK"]
 
 
-def test_a_step_that_fails_leaves_the_job_that_gave_way(make_engine):
+def test_a_failing_step_does_not_affect_the_job_that_yielded(make_engine):
     engine, piece, asked = make_engine(), threading.Event(), threading.Event()
 
     def film() -> str:
@@ -343,7 +343,7 @@ def test_a_step_that_fails_leaves_the_job_that_gave_way(make_engine):
     assert engine.running is None
 
 
-def test_giving_way_on_another_thread_runs_nothing(make_engine):
+def test_yielding_on_another_thread_runs_nothing(make_engine):
     engine, gate, ran = make_engine(), Gate(), []
 
     async def ask() -> None:
@@ -360,7 +360,7 @@ def test_giving_way_on_another_thread_runs_nothing(make_engine):
     assert ran == ["step"]
 
 
-def test_a_full_lane_leaves_room_in_the_others(make_engine):
+def test_a_full_priority_queue_leaves_room_in_the_others(make_engine):
     engine, gate = make_engine(queue_length=1), Gate()
 
     async def ask() -> None:
@@ -379,7 +379,7 @@ def test_a_full_lane_leaves_room_in_the_others(make_engine):
     asyncio.run(ask())
 
 
-def test_an_engine_whose_thread_ends_tells_those_who_wait(monkeypatch):
+def test_an_engine_whose_thread_fails_reports_the_failure(monkeypatch):
     def fail(_niceness: int) -> None:
         raise PermissionError("may not lower its niceness")
 
@@ -393,7 +393,7 @@ def test_an_engine_whose_thread_ends_tells_those_who_wait(monkeypatch):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="priorities of threads are Linux's")
-def test_an_engine_starts_at_a_niceness_that_it_may_not_lower():
+def test_an_engine_starts_if_it_cannot_change_its_niceness():
     code = (
         "import os\n"
         f"os.nice({NICENESS + 1})\n"
@@ -404,7 +404,7 @@ def test_an_engine_starts_at_a_niceness_that_it_may_not_lower():
         "print(engine.call_sync(lambda: 'works', timeout_s=120))\n"
         "engine.stop()\n"
     )
-    # While everything can still be read.
+    # Import first: after setuid the files may not be readable.
     import_first = "import numba, torch, real2sim_server.service.engine\nnumba.get_num_threads()\n"
     done = subprocess.run(
         [sys.executable, "-c", import_first + code],
@@ -417,7 +417,7 @@ def test_an_engine_starts_at_a_niceness_that_it_may_not_lower():
 
 
 class Gathered:
-    """Computes results of arguments that it was given in one go."""
+    """Computes a batch of results, and records the batches."""
 
     def __init__(self) -> None:
         self.calls: list[list[int]] = []
@@ -428,7 +428,7 @@ class Gathered:
 
 
 def waiting_together(engine, gate, calls):
-    """Outcomes of calls that wait while the engine is busy."""
+    """Results of calls that queue up while the engine is busy."""
 
     async def ask():
         busy = asyncio.create_task(engine.call(gate.job))
@@ -445,7 +445,7 @@ def waiting_together(engine, gate, calls):
     return asyncio.run(ask())
 
 
-def test_calls_of_one_key_that_wait_together_are_made_in_one_go_within_their_shares(make_engine):
+def test_waiting_calls_with_one_key_are_batched_up_to_their_shares(make_engine):
     engine, gathered, key = make_engine(), Gathered(), object()
     options = {"share": 0.4, "label": "drive", "priority": Priority.DRIVE}
     calls = [
@@ -456,7 +456,7 @@ def test_calls_of_one_key_that_wait_together_are_made_in_one_go_within_their_sha
     assert gathered.calls == [[1, 4], [2], [5]]
 
 
-def test_what_is_raised_for_one_of_several_calls_reaches_its_caller_alone(make_engine):
+def test_an_error_in_a_batch_reaches_only_its_caller(make_engine):
     engine, gathered, key = make_engine(), Gathered(), object()
     options = {"share": 0.1, "label": "drive", "priority": Priority.DRIVE, "key": key}
     calls = [engine.call_together(gathered.compute, n, **options) for n in (2, 0, 4)]

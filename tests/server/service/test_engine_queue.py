@@ -16,7 +16,7 @@ def filled(**counts: int) -> PriorityQueue[str]:
 
 
 def run(queue: PriorityQueue[str], jobs: int, seconds: float = 0.01) -> list[str]:
-    """Names of the jobs that had their turn, each of the same length."""
+    """Names of the jobs in the order they ran, all of the same duration."""
     begun = []
     for _ in range(jobs):
         job = queue.begin_next()
@@ -42,7 +42,7 @@ def test_busy_priorities_share_time_by_weight():
     assert [WEIGHTS[priority] for priority in Priority] == [16, 4, 1]
 
 
-def test_an_idle_priority_gathers_no_credit():
+def test_an_idle_priority_accumulates_no_credit():
     queue = filled(drive=200)
     run(queue, 100)
     for k in range(100):
@@ -51,7 +51,7 @@ def test_an_idle_priority_gathers_no_credit():
     assert had["bulk"] == 2
 
 
-def test_between_pieces_only_more_urgent_jobs_have_their_turn():
+def test_only_more_urgent_jobs_run_during_a_yield():
     queue = filled(view=1)
     assert queue.begin_next() == "view 0"
     queue.append("bulk", Priority.BULK)
@@ -61,7 +61,7 @@ def test_between_pieces_only_more_urgent_jobs_have_their_turn():
     assert queue.begin_more_urgent() == "drive"
 
 
-def test_urgent_jobs_do_not_starve_the_one_that_gives_way():
+def test_urgent_jobs_do_not_starve_a_yielding_job():
     queue = filled(bulk=1)
     queue.begin_next()
     begun = 0
@@ -77,7 +77,7 @@ def test_urgent_jobs_do_not_starve_the_one_that_gives_way():
     assert queue.begin_more_urgent() is not None
 
 
-def test_jobs_nobody_wants_any_more_leave_their_priority():
+def test_discarded_jobs_are_removed_from_their_queues():
     queue = filled(drive=2, bulk=2)
     queue.discard(lambda job: job.endswith("0"))
     assert len(queue) == 2
@@ -93,14 +93,14 @@ def a_begun_priority(*names: str) -> PriorityQueue[str]:
     return queue
 
 
-def test_jobs_that_join_the_running_one_leave_the_others_in_their_order():
+def test_batched_jobs_leave_the_order_of_the_others_unchanged():
     queue = a_begun_priority("a1", "a2", "b1", "a3", "b2")
     assert queue.begin_with(lambda job: job[0] == "a") == ["a2", "a3"]
     queue.end()
     assert [queue.begin_next(), queue.begin_next()] == ["b1", "b2"]
 
 
-def test_a_job_is_left_behind_once_at_most():
+def test_a_job_is_overtaken_at_most_once():
     queue = a_begun_priority("a1", "a2", "c1", "b1", "a3")
     joined = iter([True, False, False, True])
     assert queue.begin_with(lambda _: next(joined)) == ["a2", "a3"]
@@ -110,7 +110,7 @@ def test_a_job_is_left_behind_once_at_most():
     assert [queue.begin_next(), queue.begin_next()] == ["b1", "c2"]
 
 
-def test_cancelled_jobs_do_not_change_which_job_was_overtaken():
+def test_discarded_jobs_do_not_change_which_job_was_overtaken():
     queue = a_begun_priority("a1", "b1", "b2", "a2")
     assert queue.begin_with(lambda job: job[0] == "a") == ["a2"]
     queue.discard(lambda job: job == "b1")

@@ -1,7 +1,7 @@
-"""The examples in docstrings of the SDK, run against a worker.
+"""Runs the docstring examples of the SDK against a worker.
 
-Each runs by itself: first the example of the class, which makes what its methods' examples use,
-then the method's own. ``folder`` is an empty folder; the worker has the scene ``street``.
+Each runs separately: first the example of the class, which creates what its methods' examples use,
+then the method's own. ``folder`` is an empty folder. The worker has the scene ``street``.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ FUNCTIONS: tuple[Any, ...] = (
 
 @dataclass(frozen=True)
 class Documented:
-    """Something public, and the class whose example comes before its own."""
+    """A public item, and the class whose example runs before its own."""
 
     name: str
     value: Any
@@ -115,7 +115,7 @@ def documented() -> Iterator[Documented]:
     yield Documented("Real2SimError", real2sim.Real2SimError)
     for owner in SDK_CLASSES:
         yield Documented(owner.__name__, owner)
-        # The methods of a class that is generated from an asynchronous one are shown there.
+        # Document the methods of a generated sync class at the asynchronous one.
         source = {name for name, _ in methods_of(TWINS[owner])} if owner in TWINS else set()
         for name, value in methods_of(owner):
             if name not in source:
@@ -123,7 +123,7 @@ def documented() -> Iterator[Documented]:
 
 
 def methods_of(owner: type) -> Iterator[tuple[str, Any]]:
-    """Public methods that a class has itself or from a base that is not in SDK_CLASSES."""
+    """Public methods of a class, including those inherited from bases outside SDK_CLASSES."""
     for base in owner.__mro__:
         if base is owner or (base.__module__.startswith("real2sim") and base not in SDK_CLASSES):
             yield from ((n, v) for n, v in vars(base).items() if is_public_method(n, v, owner))
@@ -132,7 +132,7 @@ def methods_of(owner: type) -> Iterator[tuple[str, Any]]:
 def is_public_method(name: str, value: Any, owner: type) -> bool:
     if name.startswith("_") or not inspect.isfunction(value):
         return False
-    # What the variants share is shown in its sync form.
+    # Methods shared by both variants are shown in sync form.
     shared = value.__module__ == "real2sim._object_edits"
     return not (shared and owner.__name__.startswith("Async"))
 
@@ -155,7 +155,7 @@ def worker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningWorker]:
         backend="cpu",
         log_level="error",
     )
-    # A machine without compiled kernels takes a while to be ready.
+    # A machine without cached kernels takes a while to become ready.
     with running_worker(settings, timeout_s=280.0) as running:
         yield running
 
@@ -164,7 +164,7 @@ def worker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningWorker]:
 def names(
     worker: RunningWorker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[dict[str, Any]]:
-    """What examples find; what they leave on the worker is gone afterwards."""
+    """Names available to examples. Removes what they leave on the worker."""
     monkeypatch.setenv("REAL2SIM_URL", worker.url)
     monkeypatch.setenv("REAL2SIM_TOKEN", TOKEN)
     write_splats(make_tiny_scene().background, tmp_path / "corner.ply")
@@ -182,7 +182,7 @@ def names(
 
 
 @pytest.mark.parametrize("name", sorted(DOCUMENTED))
-def test_everything_public_has_an_example_that_runs(name: str, names: dict[str, Any]) -> None:
+def test_every_public_item_has_an_example_that_runs(name: str, names: dict[str, Any]) -> None:
     item = DOCUMENTED[name]
     assert "Examples:" in item.text, f"{name} has no example"
     module = item.value if item.owner is None else item.owner
@@ -202,7 +202,7 @@ def test_an_example_that_raises_fails() -> None:
 
 
 async def run_examples(texts: list[str], names: dict[str, Any]) -> None:
-    """Run what the texts show, in one name space; closes what is left open."""
+    """Run the examples of the texts in one namespace, then close open handles."""
     parser = doctest.DocTestParser()
     try:
         for example in itertools.chain.from_iterable(map(parser.get_examples, texts)):
@@ -214,7 +214,7 @@ async def run_examples(texts: list[str], names: dict[str, Any]) -> None:
 
 
 async def run_example(example: doctest.Example, names: dict[str, Any]) -> None:
-    """Run one example, which may await, and compare what it prints."""
+    """Run one example, which may use await, and compare its output."""
     printed = io.StringIO()
     flags = ast.PyCF_ALLOW_TOP_LEVEL_AWAIT
     names["__builtins__"] = vars(builtins)

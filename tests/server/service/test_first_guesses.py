@@ -1,4 +1,4 @@
-"""What people write at first who know NumPy, Gymnasium, PyTorch, CARLA or the nuScenes devkit.
+"""First guesses of users who know NumPy, Gymnasium, PyTorch, CARLA or the nuScenes devkit.
 
 A guess works, or its error says what to write instead.
 """
@@ -21,7 +21,7 @@ from ..conftest import make_tiny_scene
 
 pytestmark = [
     pytest.mark.network,
-    # Who tries something out closes nothing.
+    # Users who try something out do not close it.
     pytest.mark.filterwarnings("ignore::ResourceWarning"),
     pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
 ]
@@ -236,7 +236,7 @@ Planners and environments
 
 
 class Cruise:
-    """Keeps the wheel straight and 5 m/s."""
+    """Keeps straight at 5 m/s."""
 
     def reset(self, obs: real2sim.Observation) -> None: ...
 
@@ -260,7 +260,7 @@ def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 @pytest.fixture(scope="module")
 def held(url: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
-    """What a guess holds that changes nothing."""
+    """Names for guesses that change nothing."""
     with real2sim.connect(url) as sim, sim.session(scene="street") as session:
         blind = session.reset()
         obs = session.reset(sensors=["front"], lidars=["vlp-16"], privileged=True)
@@ -278,7 +278,7 @@ def held(url: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[st
 
 @pytest.fixture
 def names(held: dict[str, Any]) -> dict[str, Any]:
-    """What guesses hold, with an episode and a scenario of their own."""
+    """Names for guesses, with a separate episode and scenario."""
     held["session"].reset(action="control")
     scenario = held["sim"].scenarios.create(scene="street")
     car = scenario.objects["car_red"]
@@ -288,7 +288,7 @@ def names(held: dict[str, Any]) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(("code", "expected"), lines(WORKS))
-def test_it_works(code: str, expected: str, names: dict[str, Any]) -> None:
+def test_a_guess_gives_the_expected_value(code: str, expected: str, names: dict[str, Any]) -> None:
     given, wanted = eval(code, names), eval(expected, names)
     if isinstance(wanted, type):
         assert isinstance(given, wanted)
@@ -297,8 +297,10 @@ def test_it_works(code: str, expected: str, names: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize(("code", "expected"), lines(SAYS))
-def test_it_says_what_to_write(code: str, expected: str, names: dict[str, Any]) -> None:
-    with pytest.raises(Exception) as caught:  # noqa: PT011, which one is not the question
+def test_a_wrong_guess_raises_an_error_that_names_the_right_call(
+    code: str, expected: str, names: dict[str, Any]
+) -> None:
+    with pytest.raises(Exception) as caught:  # noqa: PT011, the exception type does not matter
         exec(code, names)
     said = " ".join([str(caught.value), *getattr(caught.value, "__notes__", ())])
     assert expected in said.replace("\\'", "'")

@@ -1,5 +1,5 @@
-"""Several workers on one store: a session goes on where its worker is no more, once and nowhere
-twice, and whoever asks the wrong worker is told what to do."""
+"""Several workers on one store. A session continues on another worker when its own is gone, and
+runs on one worker only. A request to the wrong worker gets a retryable error."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from .test_accounts import bearer
 from .test_trouble import Site
 
 LEASE_S = 300.0
-"""Longer than any test: a lease runs out where a test lets it, by :func:`put_to_sleep`."""
+"""Longer than any test. A lease only expires through :func:`put_to_sleep` [s]."""
 
 
 @pytest.fixture
@@ -28,7 +28,7 @@ def store_url(tmp_path) -> str:
 
 @pytest.fixture
 def start(run_worker, start_worker, store_url, tmp_path):
-    """Starts workers that share a store; their settings beyond that are keywords."""
+    """Start workers that share a store. Keyword arguments are other settings."""
 
     def start(worker_id: str, starter=start_worker, **settings):
         common = {"store_url": store_url, "lease_seconds": LEASE_S}
@@ -38,7 +38,7 @@ def start(run_worker, start_worker, store_url, tmp_path):
 
 
 def put_to_sleep(client: TestClient, monkeypatch) -> Callable[[], None]:
-    """Let a worker's lease run out without its knowledge; what wakes it up."""
+    """Let a worker's lease expire without its knowledge. Returns a function that wakes it up."""
     worker, awake = client.app.state.worker, threading.Event()
     leases, promise = worker.leases, worker.leases.renew
 
@@ -58,18 +58,18 @@ def put_to_sleep(client: TestClient, monkeypatch) -> Callable[[], None]:
 
 
 def tell(client: TestClient) -> None:
-    """Let a worker renew its lease now, tell others of itself, and hear of them."""
+    """Let a worker renew its lease, publish its state and read that of others now."""
     client.portal.call(client.app.state.worker.membership.tell)
 
 
 def by(client: TestClient, site: Site) -> Site:
-    """The same session, asked for elsewhere."""
+    """The same session, accessed through another client."""
     other = object.__new__(Site)
     other.__dict__ = site.__dict__ | {"client": client}
     return other
 
 
-def test_a_session_of_a_worker_that_lives_is_refused_with_what_to_do(start):
+def test_a_session_of_a_live_worker_is_refused_elsewhere_with_retry_after(start):
     site = Site(start("w0"))
     assert site.step().status_code == 200
     answer = by(start("w1"), site).step()
@@ -79,7 +79,7 @@ def test_a_session_of_a_worker_that_lives_is_refused_with_what_to_do(start):
     assert site.step().json()["step"] == 2
 
 
-def test_a_session_goes_on_elsewhere_as_if_nothing_had_happened(start, run_worker):
+def test_a_session_continues_identically_on_another_worker(start, run_worker):
     undisturbed = Site(start("w5"))
     with start("w0", run_worker) as first:
         site = Site(first)
@@ -91,7 +91,7 @@ def test_a_session_goes_on_elsewhere_as_if_nothing_had_happened(start, run_worke
     assert other.state().json()["step"] == 3
 
 
-def test_a_worker_that_slept_writes_nothing_and_sends_clients_away(start, monkeypatch):
+def test_a_worker_with_an_expired_lease_cannot_write(start, monkeypatch):
     first = start("w0")
     site = Site(first)
     assert site.step("one").status_code == 200
@@ -101,13 +101,13 @@ def test_a_worker_that_slept_writes_nothing_and_sends_clients_away(start, monkey
 
     late = site.step("three")
     assert (late.status_code, late.json()["code"]) == (503, "SESSION_ELSEWHERE")
-    # Also once it has noticed that the session is not its own.
+    # Also after it has noticed that it lost the session.
     again = site.step("three")
     assert again.json()["code"] == "SESSION_ELSEWHERE"
     assert other.step("three").json()["step"] == 3
 
 
-def test_a_worker_that_wakes_up_leaves_what_was_taken_over(start, monkeypatch):
+def test_a_waking_worker_drops_sessions_that_were_taken_over(start, monkeypatch):
     first = start("w0")
     site, kept = Site(first), Site(first)
     wake = put_to_sleep(first, monkeypatch)
@@ -118,7 +118,7 @@ def test_a_worker_that_wakes_up_leaves_what_was_taken_over(start, monkeypatch):
     assert kept.step().status_code == 200
 
 
-def test_a_driver_is_told_to_come_back_when_its_session_is_taken_over(start, monkeypatch):
+def test_the_driver_of_a_session_that_was_taken_over_is_notified(start, monkeypatch):
     first = start("w0")
     site = Site(first)
     session = first.app.state.worker.sessions._open[site.session.rpartition("/")[2]]
@@ -134,7 +134,7 @@ def test_a_driver_is_told_to_come_back_when_its_session_is_taken_over(start, mon
     wait_until(lambda: told == ["SESSION_ELSEWHERE"], "the driver to be told")
 
 
-def test_a_session_comes_back_to_a_worker_that_is_there_again(start, run_worker):
+def test_a_session_can_return_to_its_restarted_worker(start, run_worker):
     with start("w0", run_worker) as first:
         site = Site(first)
         assert site.step().status_code == 200
@@ -144,13 +144,13 @@ def test_a_session_comes_back_to_a_worker_that_is_there_again(start, run_worker)
     assert again.step().json()["step"] == 3
 
 
-def test_a_session_that_is_over_is_over_everywhere(start):
+def test_a_deleted_session_is_closed_on_every_worker(start):
     site = Site(start("w0"))
     assert site.client.delete(site.session, headers=site.token).status_code == 204
     assert by(start("w1"), site).step().json()["code"] == "SESSION_CLOSED"
 
 
-def test_sessions_and_jobs_of_a_token_are_limited_over_all_workers(start, tmp_path, held_videos):
+def test_token_limits_apply_across_all_workers(start, tmp_path, held_videos):
     tokens = tmp_path / "tokens.json"
     held = bearer(add_token(tokens, "alice", TokenLimits(sessions=2, jobs=1)))
     one, other = (start(name, tokens_file=tokens) for name in ("w0", "w1"))
@@ -174,7 +174,7 @@ def test_sessions_and_jobs_of_a_token_are_limited_over_all_workers(start, tmp_pa
     assert one.post("/v1/sessions?scene=tiny", json={}, headers=held).status_code == 201
 
 
-def test_any_worker_tells_of_all(start, run_worker):
+def test_any_worker_reports_the_whole_fleet(start, run_worker):
     with start("w1", run_worker):
         first = start("w0")
         Site(first)

@@ -1,5 +1,5 @@
-"""Whole histories of edits and steps, written by many clients through the proxy while workers are
-killed: every write that was acknowledged is there once, and none is there twice."""
+"""Consistency of edits and steps written by many clients through the proxy while workers are
+killed. Every acknowledged write is stored exactly once."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ pytestmark = [pytest.mark.network, pytest.mark.slow]
 WRITES = int(os.environ.get("REAL2SIM_TEST_WRITES", "600"))
 SCENARIOS, SESSIONS, CLIENTS, KILLS = 3, 4, 8, 3
 GIVE_UP = 0.05
-"""Share of writes whose client asks once and never learns what came of it."""
+"""Share of writes that are sent once, without reading the answer."""
 
 
 COMES_AGAIN = (409, 412, 429, 502, 503, 504)
-"""Answers after which the same request may be sent again."""
+"""Statuses after which a request is retried."""
 
 
 @dataclass
 class History:
-    """What clients know of their writes.
+    """Writes from the clients' point of view.
 
     Attributes:
-        acknowledged: by what was written to, the mark of each write and what its answer said.
-        unknown: marks of writes whose answers never came.
+        acknowledged: for each target, the mark of each write and the position in its answer.
+        unknown: marks of writes without an answer.
     """
 
     acknowledged: dict[str, dict[int, int]] = field(default_factory=dict)
@@ -54,7 +54,7 @@ def call(url: str, method: str, body: dict | None, headers: dict[str, str]) -> d
 
 
 def write(url: str, body: dict, headers: dict[str, str], *, once: bool) -> dict | None:
-    """The answer to a write; sent again under its key until there is one, or once."""
+    """The answer to a write. Retried under its key until there is one, unless ``once``."""
     headers = headers | {"Idempotency-Key": uuid.uuid4().hex}
     last = ""
 
@@ -76,7 +76,7 @@ def write(url: str, body: dict, headers: dict[str, str], *, once: bool) -> dict 
 
 
 class Site:
-    """Scenarios and sessions of a fleet, and what was written to them."""
+    """Scenarios and sessions of a fleet, and the writes to them."""
 
     def __init__(self, url: str) -> None:
         self.url = url
@@ -94,7 +94,7 @@ class Site:
         return call(self.url + path, "POST", body, {})
 
     def edit(self, mark: int, chance: random.Random) -> None:
-        """Move the post by an amount of its own."""
+        """Move the post by an amount unique to this mark."""
         name = chance.choice(self.scenarios)
         operation = {"op": "translate", "object_id": "post", "x": mark * 1e-6}
         url = f"{self.url}/v1/scenarios/{name}/operations"
@@ -103,7 +103,7 @@ class Site:
         self._note(name, mark, answer and answer["revision"])
 
     def step(self, name: str, mark: int, *, once: bool) -> None:
-        """One step of a session, whose episode begins again where it is over."""
+        """One step of a session. Resets the session when its episode is over."""
         url = f"{self.url}/v1/sessions/{name}/step"
         answer = write(url, {}, self.tokens[name], once=once)
         if answer is not None and answer.get("over"):
@@ -119,15 +119,15 @@ class Site:
             self.history.acknowledged[name][mark] = number
 
     def marks_of_scenario(self, name: str) -> list[tuple[int, int]]:
-        """Marks and revisions of all edits on record."""
+        """Marks and revisions of all recorded edits."""
         url = f"{self.url}/v1/scenarios/{name}/operations"
         entries = call(url, "GET", None, {})["entries"]
         return [(round(e["operations"][0]["x"] * 1e6), e["revision"]) for e in entries]
 
 
 def check(name: str, found: list[tuple[int, int]], history: History) -> None:
-    """Each acknowledged write is there once, at the place that its answer told; no other is there
-    that nobody has sent; and places follow one another."""
+    """Check that each acknowledged write is stored once at its reported position, that no unknown
+    mark is stored, and that positions are contiguous."""
     told = history.acknowledged[name]
     times = Counter(mark for mark, _ in found)
     assert not [mark for mark, many in times.items() if many > 1], "written twice"
@@ -139,7 +139,7 @@ def check(name: str, found: list[tuple[int, int]], history: History) -> None:
 
 
 @pytest.mark.timeout(3600)
-def test_no_acknowledged_write_is_lost_or_doubled_while_workers_are_killed(fleet):  # noqa: F811
+def test_acknowledged_writes_are_stored_exactly_once_while_workers_are_killed(fleet):  # noqa: F811
     site = Site(fleet.url)
     over, kills = threading.Event(), []
     counter, lock, begun = iter(range(1, WRITES + 1)), threading.Lock(), [0]
@@ -165,7 +165,7 @@ def test_no_acknowledged_write_is_lost_or_doubled_while_workers_are_killed(fleet
             if mark is None:
                 return
             if session is not None:
-                # Alone at its session, so that the order of its steps is known.
+                # The only client of its session, so that the order of its steps is known.
                 site.step(session, mark, once=False)
             else:
                 site.edit(mark, chance)
@@ -182,7 +182,7 @@ def test_no_acknowledged_write_is_lost_or_doubled_while_workers_are_killed(fleet
     for name in site.scenarios:
         check(name, site.marks_of_scenario(name), site.history)
     for name in site.tokens:
-        # In the order in which they were made: one after the other, anew in each episode.
+        # In the order in which they were made: consecutive, restarting with each episode.
         steps = [
             site.history.acknowledged[name][m] for m in sorted(site.history.acknowledged[name])
         ]

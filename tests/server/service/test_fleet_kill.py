@@ -1,5 +1,5 @@
-"""Three workers, HAProxy and PostgreSQL: workers are killed or stopped under sessions that are
-driven, and every session goes on elsewhere, bit for bit."""
+"""Three workers, HAProxy and PostgreSQL. Workers are killed or stopped during drives, and every
+session continues elsewhere, bit for bit."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ class Fleet:
     """Workers on one store behind one address.
 
     Attributes:
-        url: of the proxy.
-        gaps: seconds that steps took, of every drive.
+        url: address of the proxy.
+        gaps: duration of each step of all drives [s].
     """
 
     def __init__(self, url: str, store_url: str, workers: dict[str, KillableWorker]) -> None:
@@ -49,7 +49,7 @@ class Fleet:
         self._engine = sa.create_engine(store_url, poolclass=sa.NullPool)
 
     def busiest(self) -> str:
-        """The worker that has most open sessions."""
+        """The worker with the most open sessions."""
         query = (
             "SELECT worker_id FROM sessions WHERE closed_us IS NULL "
             "GROUP BY worker_id ORDER BY count(*) DESC LIMIT 1"
@@ -58,7 +58,7 @@ class Fleet:
             return str(connection.execute(sa.text(query)).scalar() or WORKERS[0])
 
     def logs_are_whole(self) -> bool:
-        """Whether every session's log has each place once, without a gap."""
+        """Whether every session log has contiguous positions without duplicates."""
         query = "SELECT count(*) - 1 - max(seq) FROM session_log GROUP BY session_id"
         with self._engine.connect() as connection:
             return all(row[0] == 0 for row in connection.execute(sa.text(query)))
@@ -98,7 +98,7 @@ def fleet(tmp_path_factory, tiny_scene, postgres) -> Iterator[Fleet]:
 
 
 def drive(fleet: Fleet, seed: int) -> list[str]:
-    """Hashes of all observations of some episodes in one session."""
+    """Hashes of all observations of several episodes in one session."""
     seen = []
     with (
         real2sim.connect(fleet.url) as client,
@@ -121,7 +121,7 @@ def undisturbed(fleet) -> list[list[str]]:
 
 
 @pytest.mark.timeout(3600)
-def test_sessions_of_killed_workers_go_on_elsewhere_bit_for_bit(fleet, undisturbed):
+def test_sessions_of_killed_workers_continue_elsewhere_bit_for_bit(fleet, undisturbed):
     chance = random.Random(5)
     told: list[float] = []
     for _ in range(KILLS):
@@ -140,7 +140,7 @@ def test_sessions_of_killed_workers_go_on_elsewhere_bit_for_bit(fleet, undisturb
     print(f"{KILLS} kills under {SESSIONS} drives: longest step {max(told):.2f} s, p95 {p95:.2f} s")
 
 
-def test_a_worker_that_was_stopped_for_ten_seconds_is_fenced_off(fleet, undisturbed):
+def test_a_worker_paused_for_ten_seconds_is_fenced_off(fleet, undisturbed):
     with ThreadPoolExecutor(SESSIONS) as drivers:
         drives = [drivers.submit(drive, fleet, seed) for seed in range(SESSIONS)]
         time.sleep(0.5)
@@ -154,9 +154,9 @@ def test_a_worker_that_was_stopped_for_ten_seconds_is_fenced_off(fleet, undistur
 
 
 @pytest.mark.timeout(3600)
-def test_a_rolling_restart_is_seen_by_no_planner(fleet, undisturbed):
-    """Workers are stopped in order and started again, one after the other, for as long as there is
-    driving; every drive is as if nothing had happened, and no error reaches its planner."""
+def test_a_rolling_restart_does_not_affect_planners(fleet, undisturbed):
+    """Workers are stopped and restarted one after the other during drives. Every drive is identical
+    and no error reaches its planner."""
     over, restarted = threading.Event(), []
 
     def restart_in_turn() -> None:

@@ -1,4 +1,4 @@
-"""A fleet whose database is away; what its proxy does."""
+"""A fleet during a database outage, and behaviour and cost of its proxy."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SCENES, EACH = 12, 4
 TIMED = int(os.environ.get("REAL2SIM_TEST_STEPS", "600"))
 
 
-def test_a_database_that_is_away_for_ten_seconds_loses_and_doubles_nothing(
+def test_a_ten_second_database_outage_does_not_change_any_drive(
     fleet: Fleet,  # noqa: F811
     undisturbed: list[list[str]],  # noqa: F811
     postgres,
@@ -42,13 +42,13 @@ def test_a_database_that_is_away_for_ten_seconds_loses_and_doubles_nothing(
     print(f"a database away for {AWAY_S:.0f} s: longest step {max(fleet.gaps):.2f} s")
 
 
-# --- what the proxy does and costs ------------------------------------------------------------
+# --- behaviour and cost of the proxy -----------------------------------------------------------
 
 
-def test_sessions_land_where_their_scene_is_and_no_worker_has_far_more_than_others(
+def test_sessions_go_to_workers_with_their_scene_and_load_is_balanced(
     fleet: Fleet,  # noqa: F811
 ):
-    """Sessions stay open: what the proxy counts is their sockets."""
+    """Sessions stay open, because the proxy counts their sockets."""
     scenes = Path(fleet.workers["w0"].scenes)
     names = [f"tiny_{k}" for k in range(SCENES)]
     for name in names:
@@ -70,12 +70,12 @@ def test_sessions_land_where_their_scene_is_and_no_worker_has_far_more_than_othe
     print(
         f"{len(found)} sessions: {right:.1%} where their scene is, busiest {most:.2f} of the mean"
     )
-    # Not all: a connection that is just being closed counts as load. By chance it would be 65 %.
+    # Not 100 %: a connection that is closing still counts as load. Chance level is 65 %.
     assert right >= 0.8
     assert most <= 1.5
 
 
-def test_observations_through_the_proxy_are_those_of_the_worker_and_its_cost_is_told(
+def test_observations_through_the_proxy_equal_direct_ones(
     fleet: Fleet,  # noqa: F811
 ):
     def egos(url: str, times: list[float]) -> list[str]:

@@ -1,4 +1,4 @@
-"""How seldom a worker's process looks for garbage."""
+"""Garbage collection settings of a worker process."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ def settings_of_before():
     gc.unfreeze()
 
 
-def test_what_was_there_at_the_start_is_searched_through_no_more():
+def test_initial_objects_are_frozen():
     there = [[] for _ in range(1000)]
     freeze_objects()
     assert gc.get_freeze_count() >= len(there)
 
 
-def test_many_steps_pass_between_searches_and_later_garbage_is_found_still():
+def test_collections_are_rare_and_still_find_later_garbage():
     class Knot:
         """Refers to itself."""
 

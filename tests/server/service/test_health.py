@@ -27,13 +27,13 @@ def samples(client) -> dict[str, float]:
     }
 
 
-def test_a_started_worker_lives_and_becomes_ready(client):
+def test_a_started_worker_is_live_and_becomes_ready(client):
     assert client.get("/livez").json() == {"status": "alive"}
     wait_ready(client)
     assert Readiness.model_validate(client.get("/readyz").json()).ready
 
 
-def test_while_kernels_warm_up_it_lives_but_is_not_ready(make_settings, monkeypatch):
+def test_a_worker_is_live_but_not_ready_while_kernels_warm_up(make_settings, monkeypatch):
     warm = threading.Event()
     monkeypatch.setattr("real2sim_server.service.renderer.warm_up", lambda _: warm.wait(LIMIT_S))
     with TestClient(create_app(make_settings()), base_url="http://127.0.0.1") as client:
@@ -49,7 +49,7 @@ def test_while_kernels_warm_up_it_lives_but_is_not_ready(make_settings, monkeypa
         assert told == [{"warming up kernels"}]
 
 
-def test_while_kernels_are_compiled_it_says_how_many_are_ready(make_settings, monkeypatch):
+def test_readiness_reports_the_progress_of_kernel_compilation(make_settings, monkeypatch):
     warm = threading.Event()
     monkeypatch.setattr("real2sim_server.service.renderer.warm_up", lambda _: warm.wait(LIMIT_S))
     monkeypatch.setattr("real2sim_server.service.warm_up.made", Made(12, 40, compiled=3))
@@ -59,7 +59,7 @@ def test_while_kernels_are_compiled_it_says_how_many_are_ready(make_settings, mo
         wait_ready(client)
 
 
-def test_it_is_ready_before_the_kernels_of_small_images(make_settings, monkeypatch):
+def test_a_worker_is_ready_before_the_kernels_for_small_images(make_settings, monkeypatch):
     made = threading.Event()
     monkeypatch.setattr(
         "real2sim_server.service.renderer.warm_up_small_images",
@@ -71,7 +71,7 @@ def test_it_is_ready_before_the_kernels_of_small_images(make_settings, monkeypat
         made.set()
 
 
-def test_a_failed_warm_up_is_the_reason(make_settings, monkeypatch):
+def test_a_failed_warm_up_is_reported_as_the_reason(make_settings, monkeypatch):
     def fail(_backend):
         raise RuntimeError("no compiler")
 
@@ -81,7 +81,7 @@ def test_a_failed_warm_up_is_the_reason(make_settings, monkeypatch):
         assert client.get("/livez").status_code == 200
 
 
-def test_a_job_that_does_not_end_stalls_the_worker(start_worker, manual_clock):
+def test_a_job_that_hangs_makes_the_worker_not_live(start_worker, manual_clock):
     client = start_worker(stall_seconds=60)
     wait_ready(client)
     engine, go_on = client.app.state.worker.engine, threading.Event()
@@ -97,7 +97,7 @@ def test_a_job_that_does_not_end_stalls_the_worker(start_worker, manual_clock):
     assert "'stuck'" in response.json()["reason"]
 
 
-def test_a_lost_device_is_neither_live_nor_ready(client):
+def test_a_worker_with_a_lost_device_is_neither_live_nor_ready(client):
     wait_ready(client)
 
     def lose():
@@ -128,7 +128,7 @@ def test_metrics_can_be_turned_off(start_worker):
     assert start_worker(metrics=False).get("/metrics").status_code == 404
 
 
-def test_two_workers_in_one_process_count_apart(start_worker, tmp_path):
+def test_two_workers_in_one_process_have_separate_metrics(start_worker, tmp_path):
     first, second = start_worker(), start_worker(data_dir=tmp_path / "other")
     first.get("/v1/server")
     name = "real2sim_http_request_duration_seconds_count/v1/server200GET"
@@ -136,7 +136,7 @@ def test_two_workers_in_one_process_count_apart(start_worker, tmp_path):
     assert name not in samples(second)
 
 
-def test_a_store_that_cannot_be_opened_ends_the_start_and_leaves_no_thread(make_settings, tmp_path):
+def test_a_failed_store_aborts_the_start_and_leaves_no_thread(make_settings, tmp_path):
     (tmp_path / "data" / "real2sim.db").mkdir(parents=True)
     before = threading.active_count()
     app = create_app(make_settings())
@@ -145,7 +145,7 @@ def test_a_store_that_cannot_be_opened_ends_the_start_and_leaves_no_thread(make_
     assert threading.active_count() <= before
 
 
-def test_metrics_tell_of_store_jobs_and_sockets(client):
+def test_metrics_include_store_jobs_and_sockets(client):
     client.put("/v1/scenes/tiny/residency")
     info = client.post("/v1/sessions?scene=tiny", json={"reset": {"action": "control"}}).json()
     url = f"/v1/sessions/{info['session_id']}/drive"
@@ -177,7 +177,7 @@ def test_missed_deadlines_are_counted(client):
     assert samples(client)["real2sim_missed_deadlines_total"] == 1
 
 
-def test_a_drive_socket_leaves_a_line_at_its_beginning_and_end(client, logged):
+def test_opening_and_closing_a_drive_socket_is_logged(client, logged):
     info = client.post("/v1/sessions?scene=tiny").json()
     url = f"/v1/sessions/{info['session_id']}/drive"
     name = HERE | {"X-Real2Sim-Client": "planner 7"}
@@ -190,7 +190,7 @@ def test_a_drive_socket_leaves_a_line_at_its_beginning_and_end(client, logged):
     assert lines["drive socket closed"]["steps"] == 0
 
 
-def test_a_view_socket_leaves_a_line_at_its_beginning_and_end(client, logged):
+def test_opening_and_closing_a_view_socket_is_logged(client, logged):
     made = client.post("/v1/scenarios", json={"scene": "tiny"}).json()
     with client.websocket_connect(
         f"/v1/scenarios/{made['scenario_id']}/view", headers=HERE

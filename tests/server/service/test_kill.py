@@ -1,4 +1,4 @@
-"""What was acknowledged is there after the worker was killed."""
+"""Acknowledged writes survive a killed worker."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ async def render_unless_held(renderer, render_request, context):
 
 exports._render_frame = render_unless_held
 """
-"""Code for a worker, whose videos wait behind their first frame for as long as a file exists."""
+"""Worker code that pauses videos after their first frame while a file exists."""
 
 KILLS = 2
 MAX_BETWEEN = 6
@@ -41,7 +41,7 @@ MAX_BETWEEN = 6
 
 @pytest.fixture
 def start(scenes_dir, tmp_path):
-    """Starts workers in processes of their own on the same store; the next kills the one before."""
+    """Start workers in processes on the same store. Each start kills the previous worker."""
     worker = KillableWorker(
         scenes=scenes_dir,
         data=tmp_path / "data",
@@ -61,7 +61,7 @@ def start(scenes_dir, tmp_path):
         yield another
 
 
-def test_nothing_acknowledged_is_lost_between_any_two_requests(start):
+def test_acknowledged_writes_survive_kills_between_requests(start):
     choose = random.Random(7)
     client = start()
     url = client.post("/v1/scenarios", json={"scene": "tiny"}).headers["Location"]
@@ -75,7 +75,7 @@ def test_nothing_acknowledged_is_lost_between_any_two_requests(start):
         assert client.get(url).json()["revision"] == len(acknowledged)
         assert client.get("/v1/assets/kept").status_code == 200
         if acknowledged:
-            # The answer that was lost with the process can be asked for again.
+            # The lost answer can be requested again.
             last = acknowledged[-1]
             again = client.post(
                 last["url"], json=last["json"], headers={"Idempotency-Key": last["key"]}
@@ -99,14 +99,14 @@ def test_nothing_acknowledged_is_lost_between_any_two_requests(start):
 
 
 @pytest.mark.slow
-def test_an_asset_whose_answer_was_not_stored_yet_is_answered_after_the_kill(start, tmp_path):
+def test_an_asset_without_a_stored_answer_is_answered_after_the_kill(start, tmp_path):
     client = start()
     cut = {"scene": "tiny", "object_id": "car_red", "asset_id": "cut"}
     request = {"url": "/v1/assets", "json": cut, "headers": {"Idempotency-Key": "once"}}
     bundle = tmp_path / "data/assets/cut.r2a"
     wait_ready(client)
     with closing(sqlite3.connect(tmp_path / "data/real2sim.db")) as store:
-        store.execute("BEGIN IMMEDIATE")  # Whoever writes waits.
+        store.execute("BEGIN IMMEDIATE")  # Blocks all writers.
         asking = threading.Thread(target=_without_answer, args=(client, request))
         asking.start()
         wait_until(bundle.exists, "the asset's files")
@@ -127,8 +127,8 @@ def _without_answer(client: httpx2.Client, request: dict) -> None:
 
 @pytest.fixture
 def two_workers(scenes_dir, tmp_path):
-    """Two workers in processes of their own on one store."""
-    # A lease runs out where a test lets it.
+    """Two workers in their own processes on one store."""
+    # Leases expire only when a test lets them.
     shared = {
         "REAL2SIM_STORE_URL": f"sqlite:///{tmp_path / 'shared.db'}",
         "REAL2SIM_LEASE_SECONDS": "600",
@@ -155,7 +155,7 @@ VIDEO = {"scene": "tiny", "camera": "front", "width": 64, "fps": 4}
 
 
 def running(client: httpx2.Client, tmp_path: Path) -> str:
-    """Address of a job that has drawn one frame, and draws the next once ``hold`` is gone."""
+    """Path of a job that has drawn one frame. It draws the next once ``hold`` is removed."""
     (tmp_path / "hold").touch()
     job = client.post("/v1/exports", json=VIDEO).headers["Location"]
     wait_until(lambda: client.get(job).json()["progress"] > 0, "the first frame")
@@ -163,7 +163,7 @@ def running(client: httpx2.Client, tmp_path: Path) -> str:
 
 
 @pytest.mark.slow
-def test_a_job_of_a_killed_worker_is_done_by_another(two_workers, tmp_path):
+def test_a_job_of_a_killed_worker_is_completed_by_another(two_workers, tmp_path):
     (first, client), (_, other) = two_workers
     job = running(client, tmp_path)
     assert other.get(job).json()["worker"] == "w0"
@@ -177,7 +177,7 @@ def test_a_job_of_a_killed_worker_is_done_by_another(two_workers, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_job_is_cancelled_by_way_of_another_worker(two_workers, tmp_path):
+def test_a_job_is_cancelled_through_another_worker(two_workers, tmp_path):
     (_, client), (_, other) = two_workers
     job = running(client, tmp_path)
     cancelled = other.delete(job)
@@ -186,7 +186,7 @@ def test_a_job_is_cancelled_by_way_of_another_worker(two_workers, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_worker_that_was_killed_goes_on_with_its_jobs(start, tmp_path):
+def test_a_restarted_worker_resumes_its_jobs(start, tmp_path):
     job = running(start(), tmp_path)
     client = start()
     assert client.get(job).json()["attempt"] == 2
@@ -195,7 +195,7 @@ def test_a_worker_that_was_killed_goes_on_with_its_jobs(start, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_data_set_goes_on_with_the_clips_that_it_had(start):
+def test_a_data_set_resumes_with_its_finished_clips(start):
     body = {"kind": "dataset", "scene": "tiny", "formats": ["kitti"], "width": 320}
     client = start()
 

@@ -1,4 +1,4 @@
-"""A drive that outlasts its recording: reproducible to the bit, and resumed after a kill."""
+"""A drive longer than its recording is reproducible to the bit and resumes after a kill."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ DRIVE = {
 
 
 class Workers:
-    """One worker after another, on the demo's street and one store."""
+    """One worker after another, on the demo street and one store."""
 
     def __init__(self, worker: KillableWorker, stack: ExitStack) -> None:
         self._worker, self._stack = worker, stack
         self.client = self._connected()
 
     def kill(self) -> None:
-        """End the worker as it is; ``client`` is of the next one."""
+        """Kill the worker. ``client`` then belongs to the next one."""
         self._worker.kill_and_start()
         self.client = self._connected()
 
@@ -63,7 +63,7 @@ def workers(tmp_path: Path) -> Iterator[Workers]:
 
 
 def hashed(obs: real2sim.Observation) -> str:
-    """Of all that an observation shows."""
+    """Hash of an observation."""
     parts = [obs.step, obs.ego, obs.ego_truth, obs.agents, obs.events, obs.metrics, obs.drawn]
     digest = hashlib.sha256(repr([*parts, obs.lap, obs.route.tolist()]).encode())
     for camera in obs.frames:
@@ -72,8 +72,7 @@ def hashed(obs: real2sim.Observation) -> str:
 
 
 def drive(workers: Workers, options: dict, *, kills: tuple[int, ...]) -> tuple[list[str], dict]:
-    """Hashes of all observations of a drive whose worker is killed after some steps, and a few
-    facts about it."""
+    """Observation hashes and statistics of a drive whose worker is killed after some steps."""
     planner, session = Idm(speed=8.0), workers.client.session(scene="street").open()
     sensors = [{"camera": "front", "width": 64, "codec": "raw", "period_us": 500_000}]
     obs = session.reset(sensors=sensors, **options)
@@ -92,8 +91,8 @@ def drive(workers: Workers, options: dict, *, kills: tuple[int, ...]) -> tuple[l
     return hashes, facts
 
 
-def test_a_drive_beyond_the_log_is_the_same_after_a_kill(workers):
-    # From shortly before the seam of the loop to shortly after it.
+def test_a_drive_across_the_loop_seam_is_identical_after_a_kill(workers):
+    # From shortly before the loop seam to shortly after it.
     options = DRIVE | {"start_us": 9_000_000, "horizon": 40}
     whole, facts = drive(workers, options, kills=())
     assert facts["lap"] == 1
@@ -103,7 +102,7 @@ def test_a_drive_beyond_the_log_is_the_same_after_a_kill(workers):
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
-def test_a_drive_of_three_minutes_is_the_same_after_kills(workers):
+def test_a_three_minute_drive_is_identical_after_kills(workers):
     options = DRIVE | {"horizon": 1800}
     whole, facts = drive(workers, options, kills=())
     assert facts["reason"] == "horizon"

@@ -1,4 +1,4 @@
-"""What killed runs have left goes at the next start; what is old goes by itself."""
+"""Cleanup of leftovers at the start, and of old data later."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .waiting import succeeded
 HOUR_S = 3600
 
 
-def test_the_upload_of_a_worker_that_was_killed_is_gone_after_the_next_start(run_worker, tmp_path):
+def test_uploads_of_a_killed_worker_are_removed_at_the_next_start(run_worker, tmp_path):
     assets = tmp_path / "data" / "assets"
     (assets / ".upload-abcdef012345").mkdir(parents=True)
     (assets / ".upload-abcdef012345" / "big.ply").write_bytes(bytes(1000))
@@ -23,7 +23,7 @@ def test_the_upload_of_a_worker_that_was_killed_is_gone_after_the_next_start(run
         assert list(assets.iterdir()) == []
 
 
-def test_an_upload_that_is_under_way_outlives_the_hourly_round(run_worker, tmp_path):
+def test_an_upload_in_progress_survives_the_hourly_sweep(run_worker, tmp_path):
     staging = tmp_path / "data" / "assets" / ".upload-abcdef012345"
     with run_worker() as client:
         staging.mkdir(parents=True)
@@ -33,7 +33,7 @@ def test_an_upload_that_is_under_way_outlives_the_hourly_round(run_worker, tmp_p
         assert staging.exists()
 
 
-def test_what_another_worker_is_uploading_to_a_shared_folder_stays(run_worker, scenes_dir):
+def test_recent_uploads_of_another_worker_in_a_shared_folder_are_kept(run_worker, scenes_dir):
     fresh, old = scenes_dir / ".upload-aaaaaaaaaaaa.ply", scenes_dir / ".upload-bbbbbbbbbbbb.ply"
     for file in (fresh, old):
         file.write_bytes(b"ply")
@@ -47,7 +47,7 @@ def test_what_another_worker_is_uploading_to_a_shared_folder_stays(run_worker, s
         old.unlink(missing_ok=True)
 
 
-def test_a_folder_that_was_moved_aside_goes_back_where_its_place_is_empty(tmp_path):
+def test_a_folder_moved_aside_is_restored_if_its_name_is_free(tmp_path):
     for name in (".kept.r2s.old-0123456789ab", ".gone.r2s.old-0123456789ab", "gone.r2s"):
         (tmp_path / name).mkdir()
     (tmp_path / ".half.r2s.tmp-0123456789ab").mkdir()
@@ -56,7 +56,7 @@ def test_a_folder_that_was_moved_aside_goes_back_where_its_place_is_empty(tmp_pa
     assert {p.name for p in tmp_path.iterdir()} == {"kept.r2s", "gone.r2s", ".hidden"}
 
 
-def test_old_jobs_go_with_their_files(client):
+def test_old_jobs_are_deleted_with_their_files(client):
     body = {"scene": "tiny", "camera": "front", "fps": 1, "width": 64}
     job = succeeded(client, client.post("/v1/exports", json=body))
     worker = client.app.state.worker

@@ -1,4 +1,4 @@
-"""The notebook of first scripts, cell by cell against a worker."""
+"""Runs the getting-started notebook, cell by cell, against a worker."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ def worker(tmp_path: Path) -> Iterator[RunningWorker]:
     settings = Settings(
         data_dir=tmp_path / "data", scenes_dir=tmp_path / "scenes", port=0, backend="cpu"
     )
-    # A machine without compiled kernels takes a while to be ready.
+    # A machine without cached kernels takes a while to become ready.
     with running_worker(settings, timeout_s=280.0) as running:
         yield running
 
 
 def shown(source: str, names: dict[str, Any]) -> Any:
-    """What a notebook shows below a cell: the value of its last line."""
+    """Output of a notebook cell: the value of its last line."""
     tree = ast.parse(source)
     last = tree.body.pop() if isinstance(tree.body[-1], ast.Expr) else None
     exec(compile(tree, NOTEBOOK.name, "exec"), names)
@@ -57,6 +57,6 @@ def test_every_cell_runs(
     assert len(images) == 4
     assert all(image._repr_jpeg_().startswith(b"\xff\xd8") for image in images)
     assert (tmp_path / "film.webm").stat().st_size > 1000
-    # What the notebook made is gone from the worker.
+    # The notebook has removed what it created on the worker.
     with names["real2sim"].connect() as sim:
         assert not list(sim.scenarios)

@@ -1,5 +1,5 @@
-"""A disk that is full or cannot be written to, a clock that goes back, a database that is away for
-half a minute: each has an answer of its own, nothing is lost, and all goes on by itself."""
+"""Full or unwritable disks, clock shifts, and a database outage of half a minute. Each has a
+specific error, no data is lost, and the worker recovers without help."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ pytestmark = pytest.mark.network
 
 OUTAGE_S, MIN_ROUNDS = 30.0, 20
 PATIENT = {"REAL2SIM_STORE_TIMEOUT_SECONDS": "60"}
-"""No disk that works is slower, however busy the machine is."""
+"""Slower than any working disk, even on a busy machine."""
 JOB = {"scene": "tiny", "camera": "front", "fps": 2, "width": 64}
 CUT = {"scene": "tiny", "object_id": "car_red"}
 
 
-# --- a disk that refuses to be written to -----------------------------------------------------
+# --- unwritable disk ----------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +43,7 @@ def system(tmp_path_factory) -> FailingSystem:
 
 @pytest.fixture(scope="module")
 def apart(system, tiny_scene, worker_kernels) -> Iterator[httpx2.Client]:
-    """A worker in a process of its own, on that system."""
+    """A worker in its own process on the failing system."""
     scenes = system.folder.parent / "scenes"
     save_scene(tiny_scene, scenes / "tiny.r2s")
     log_file = system.folder.parent / "worker.log"
@@ -57,7 +57,7 @@ def apart(system, tiny_scene, worker_kernels) -> Iterator[httpx2.Client]:
         assert "Traceback" not in log_file.read_text()
 
 
-def test_a_folder_that_cannot_be_written_to_is_told_and_nothing_is_lost(apart, system):
+def test_an_unwritable_folder_is_reported_and_no_data_is_lost(apart, system):
     site = Site(apart)
     assert site.edit().status_code == 200
     for number, code, status in (
@@ -82,9 +82,7 @@ def test_a_folder_that_cannot_be_written_to_is_told_and_nothing_is_lost(apart, s
         site.check_nothing_is_lost()
 
 
-def test_an_upload_to_a_folder_that_cannot_be_written_to_is_told_so(
-    apart, system, tmp_path, tiny_scene
-):
+def test_an_upload_to_an_unwritable_folder_is_refused(apart, system, tmp_path, tiny_scene):
     write_splats(tiny_scene.background, tmp_path / "car.ply")
     form = {"data": {"asset_id": "car", "category": "car"}}
 
@@ -109,8 +107,8 @@ def test_an_upload_to_a_folder_that_cannot_be_written_to_is_told_so(
         (NO_SPACE, "STORAGE_FULL"),
     ],
 )
-def test_a_job_whose_files_cannot_be_written_fails_by_name(apart, system, number, code):
-    # Its folder, what the encoder writes, and the video once it is whole.
+def test_a_job_with_unwritable_files_fails_with_a_storage_error(apart, system, number, code):
+    # The job's folder, the encoder's output, and the final video.
     for refused in ("jobs/job_*", "jobs/job_*/.video*", "jobs/job_*/video.webm"):
         with system.refusing_writes(number, to=refused):
             ended = finished(apart, apart.post("/v1/exports", json=JOB))
@@ -118,7 +116,7 @@ def test_a_job_whose_files_cannot_be_written_fails_by_name(apart, system, number
         assert ended["error"]["code"] == code, refused
 
 
-def test_a_clock_that_goes_back_by_an_hour_and_forth_again_changes_nothing(apart, system):
+def test_a_clock_set_back_and_forth_by_an_hour_has_no_effect(apart, system):
     site = Site(apart)
     assert site.edit("before").status_code == 200
     before = apart.get("/v1/scenarios").json()["scenarios"]
@@ -140,7 +138,7 @@ def test_a_clock_that_goes_back_by_an_hour_and_forth_again_changes_nothing(apart
 
 
 def rounds() -> Iterator[None]:
-    """Rounds of an outage, until it has lasted long enough and there were some."""
+    """Rounds of an outage, until it has lasted long enough with enough rounds."""
     began, count = time.monotonic(), 0
     while count < MIN_ROUNDS or time.monotonic() - began < OUTAGE_S:
         yield
@@ -148,7 +146,7 @@ def rounds() -> Iterator[None]:
         count += 1
 
 
-# --- a database that is away ------------------------------------------------------------------
+# --- database outage ----------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -162,9 +160,7 @@ def own_postgres() -> Iterator[Postgres]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("trouble", [stopped, Postgres.frozen], ids=["stopped", "frozen"])
-def test_a_database_that_is_away_for_half_a_minute_costs_nothing_but_the_time(
-    trouble, own_postgres, start_worker
-):
+def test_a_database_outage_of_half_a_minute_loses_no_data(trouble, own_postgres, start_worker):
     client = start_worker(store_url=own_postgres.new_database(), store_timeout_seconds=2)
     site = Site(client)
     accepted(lambda: site.edit("first"))
@@ -211,9 +207,7 @@ def test_a_database_that_is_away_for_half_a_minute_costs_nothing_but_the_time(
     [(READ_ONLY, "STORAGE_UNAVAILABLE", 503), (NO_SPACE, "STORAGE_FULL", 507)],
     ids=["read-only", "full"],
 )
-def test_a_folder_that_takes_nothing_for_half_a_minute_costs_nothing_but_the_time(
-    apart, system, number, code, status
-):
+def test_an_unwritable_folder_for_half_a_minute_loses_no_data(apart, system, number, code, status):
     site = Site(apart)
     assert site.edit().status_code == 200
     assert site.step().status_code == 200
@@ -234,17 +228,17 @@ def test_a_folder_that_takes_nothing_for_half_a_minute_costs_nothing_but_the_tim
 
 
 @pytest.mark.slow
-def test_a_disk_that_is_full_for_half_a_minute_costs_nothing_but_the_time(small_disk, start_worker):
-    """A real one, where there is leave to mount one."""
+def test_a_full_disk_for_half_a_minute_loses_no_data(small_disk, start_worker):
+    """Uses a real small disk, if the test may mount one."""
     client = start_worker(data_dir=small_disk / "data")
     site = Site(client)
     assert site.edit().status_code == 200
     with filled(small_disk):
         for _ in rounds():
-            # An episode has but few steps.
+            # An episode has only a few steps.
             steps = [site.step()] if site.steps < 10 else []
             for answer in (site.edit(), *steps):
-                if answer.status_code != 200:  # There may be some pages left in the journal.
+                if answer.status_code != 200:  # The journal may have a few pages left.
                     assert_told(answer, "STORAGE_FULL", 507)
             assert client.get("/livez").status_code == 200
         wait_until(lambda: site.edit().status_code != 200 and not is_ready(client), "a full disk")
@@ -256,7 +250,7 @@ def test_a_disk_that_is_full_for_half_a_minute_costs_nothing_but_the_time(small_
 
 
 @pytest.mark.slow
-def test_a_clock_that_is_an_hour_behind_for_half_a_minute_changes_nothing(apart, system):
+def test_a_clock_an_hour_behind_for_half_a_minute_has_no_effect(apart, system):
     site = Site(apart)
     assert site.edit("before").status_code == 200
     made = []
@@ -266,7 +260,7 @@ def test_a_clock_that_is_an_hour_behind_for_half_a_minute_changes_nothing(apart,
             assert site.edit("before").headers["Idempotent-Replayed"] == "true"
             site.edits -= 1
             assert site.edit().status_code == 200
-            if site.steps < 10:  # An episode has but few.
+            if site.steps < 10:  # An episode has only a few steps.
                 assert site.step().status_code == 200
             made.append(apart.post("/v1/scenarios", json={"scene": "tiny"}).headers["Location"])
             assert is_ready(apart)

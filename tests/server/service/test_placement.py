@@ -1,4 +1,4 @@
-"""Where the proxy's configuration sends what, with small servers in the workers' places."""
+"""Routing by the shipped proxy configuration, with small servers in place of the workers."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ READY = "up ready 100%"
 
 
 class Stand:
-    """In the place of a worker: says its name to whoever asks, and to its proxy what it is told."""
+    """A fake worker that answers with its name and reports a configurable state to its proxy."""
 
     def __init__(self, name: str) -> None:
         stand = self
@@ -43,7 +43,7 @@ class Stand:
             do_POST = do_GET
 
             def log_message(self, *_given) -> None:
-                """Nobody reads it."""
+                """Log nothing."""
 
         class Word(StreamRequestHandler):
             def handle(self) -> None:
@@ -95,7 +95,7 @@ def site(tmp_path: Path) -> Iterator[Site]:
         stand.stop()
 
 
-def test_the_configuration_that_is_shipped_is_valid(tmp_path):
+def test_the_shipped_configuration_is_valid(tmp_path):
     text = SHIPPED.read_text()
     done = subprocess.run(
         [program(), "-c", "-f", str(SHIPPED)], capture_output=True, text=True, check=False
@@ -104,20 +104,20 @@ def test_the_configuration_that_is_shipped_is_valid(tmp_path):
     assert "use-server" in text
 
 
-def test_new_sessions_go_where_their_scene_is_and_scenes_to_all_workers(site):
+def test_new_sessions_are_placed_by_scene_and_spread_over_all_workers(site):
     scenes = [f"scene_{k}" for k in range(60)]
     asked = [{scene: site.new(scene) for scene in scenes} for _ in range(5)]
     usual = {scene: Counter(a[scene] for a in asked).most_common(1)[0] for scene in scenes}
-    # Not all: a connection that is just being closed counts as load. By chance it would be half.
+    # Not 100 %: a connection that is closing still counts as load. Chance level is 50 %.
     assert sum(many for _, many in usual.values()) >= 0.75 * 5 * len(scenes)
     shares = Counter(name for name, _ in usual.values())
     assert set(shares) == set(NAMES)
-    # Of 60 scenes a hash gives no worker more than twice its part.
+    # With 60 scenes the hash gives no worker more than twice its share.
     assert max(shares.values()) <= 40
 
 
-def test_a_worker_that_drains_keeps_its_sessions_and_gets_no_new_ones(site):
-    # One scene alone would not do: the balance of connections can move it for one request.
+def test_a_draining_worker_keeps_its_sessions_and_gets_no_new_ones(site):
+    # One scene is not enough: load balancing can move it for one request.
     def hosts() -> set[str]:
         return {site.new(f"scene_{k}") for k in range(30)}
 
@@ -128,13 +128,13 @@ def test_a_worker_that_drains_keeps_its_sessions_and_gets_no_new_ones(site):
     wait_until(lambda: "w1" in hosts(), "w1 to get new sessions again")
 
 
-def test_sessions_of_a_worker_that_is_down_or_unknown_go_to_one_that_is_there(site):
+def test_sessions_of_a_down_or_unknown_worker_go_to_a_live_one(site):
     site.stands["w2"].word = "down"
     wait_until(lambda: site.ask("/v1/sessions/w2.7f/step") != "w2", "the proxy to hear of it")
     assert site.ask("/v1/sessions/w9.7f/step") in ("w0", "w1")
 
 
-def test_a_worker_that_has_gone_costs_no_request(site):
+def test_no_request_fails_when_a_worker_disappears(site):
     site.stands["w0"].stop()
     answers = [site.ask("/v1/sessions/w0.7f/step") for _ in range(10)]
     assert set(answers) <= {"w1", "w2"}

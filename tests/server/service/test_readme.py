@@ -1,4 +1,4 @@
-"""The Python examples of the README, as they stand there, on a street as its commands make it."""
+"""Runs the Python examples of the README on a small street made as its commands do."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ COARSE = InitialiseOptions(
 
 @pytest.fixture(scope="module")
 def street() -> Scene:
-    """All objects and lanes of the README's street, coarsely drawn."""
+    """All objects and lanes of the README's street, rendered coarsely."""
     log = log_of_frames(generate_log(SyntheticConfig()), (0, 30, 59))
     return initialise_scene(log, options=COARSE)
 
@@ -45,7 +45,7 @@ def worker_url(street, tmp_path_factory) -> Iterator[str]:
 
 @pytest.fixture
 def run_example(worker_url, monkeypatch, tmp_path):
-    """Runs the only example that has some words in it, and returns its names."""
+    """Run the only example that contains the given text. Returns its names."""
     text = README.read_text(encoding="utf-8").replace('"demo_street"', '"street"')
     blocks = re.findall(r"```python\n(.*?)```", text, re.S)
     connect = real2sim.connect
@@ -62,7 +62,7 @@ def run_example(worker_url, monkeypatch, tmp_path):
     return run
 
 
-def test_the_car_of_the_edit_stands_in_the_lane_that_was_driven(run_example, worker_url, street):
+def test_the_car_of_the_edit_is_in_the_lane_of_the_ego(run_example, worker_url, street):
     names = run_example("car in my lane")
     names["sim"].close()
     scenario = httpx2.get(f"{worker_url}/v1/scenarios/{names['scenario'].scenario_id}").json()
@@ -77,6 +77,6 @@ def test_the_car_of_the_edit_stands_in_the_lane_that_was_driven(run_example, wor
     assert Path("after.jpg").read_bytes()[:2] == b"\xff\xd8"
 
 
-def test_the_planner_drives(run_example, capsys):
+def test_the_planner_example_drives_and_prints_scores(run_example, capsys):
     run_example("session.step(")["sim"].close()
     assert "pdms" in capsys.readouterr().out

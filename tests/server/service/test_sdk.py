@@ -1,4 +1,4 @@
-"""The SDK's handles against a real worker."""
+"""The handles of the SDK against a real worker."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def scenario(client):
     return client.scenarios.create(scene="tiny", name="cut-in")
 
 
-def test_every_edit_of_an_object_is_one_revision_under_ones_name(scenario):
+def test_every_object_edit_is_one_revision_with_the_client_name(scenario):
     car = scenario.objects["car_blue"]
     car.translate(y=3.2, start_us=500_000, blend_us=1_000_000)
     car.rotate(angle=0.2)
@@ -79,7 +79,7 @@ def test_every_edit_of_an_object_is_one_revision_under_ones_name(scenario):
     assert edited.velocity.linear == (12.0, 0.0, 0.0)
 
 
-def test_edits_of_the_scenario_itself(scenario):
+def test_scenario_edits_are_applied(scenario):
     scenario.erase_region(position=(15, 0, 0), size=(4, 4, 1), region_id="hole")
     scenario.add_box(position=(20, 0, 1), size=(1, 4, 2))
     scenario.add_plane(point=(0, 0, 0))
@@ -94,7 +94,7 @@ def test_edits_of_the_scenario_itself(scenario):
     assert scenario.info.start_us == 500_000
 
 
-def test_undo_and_redo_bring_objects_back(scenario):
+def test_undo_and_redo_restore_and_remove_an_object(scenario):
     scenario.objects["post"].delete()
     assert "post" not in scenario.objects
     scenario.undo()
@@ -103,7 +103,7 @@ def test_undo_and_redo_bring_objects_back(scenario):
     assert "post" not in scenario.objects
 
 
-def test_an_asset_goes_from_one_scene_into_a_scenario(client, scenario):
+def test_an_asset_is_cut_from_a_scene_and_inserted(client, scenario):
     cut = client.assets.cut(scene="tiny", object_id="car_red", asset_id="red_car")
     car = scenario.insert("red_car", position=(22, 3, 9))
 
@@ -122,7 +122,7 @@ def test_a_splat_file_is_uploaded(client, tmp_path, tiny_scene):
     assert info.size[0] == pytest.approx(9.0)
 
 
-def test_a_scenario_is_forked_and_carried_in_a_document(client, scenario):
+def test_a_scenario_is_forked_and_imported_from_a_document(client, scenario):
     scenario.objects["post"].delete()
     fork = scenario.fork(name="other")
     copy = client.scenarios.import_document(scenario.export().model_dump(mode="json"))
@@ -131,19 +131,19 @@ def test_a_scenario_is_forked_and_carried_in_a_document(client, scenario):
     assert list(copy.objects) == list(fork.objects) == ["car_red", "car_blue"]
 
 
-def test_a_video_is_waited_for_and_fetched(client, scenario, tmp_path):
+def test_a_video_job_is_awaited_and_downloaded(client, scenario, tmp_path):
     seen = []
     job = client.jobs.export_video(scenario=scenario.scenario_id, camera="front", width=64)
     job.wait(timeout=LIMIT_S, on_progress=seen.append)
     path = job.download("video.webm", tmp_path / "deep" / "video.webm")
 
     assert job.result["frames"] == 21
-    assert path.read_bytes()[:4] == bytes([0x1A, 0x45, 0xDF, 0xA3])  # EBML, which WebM is
+    assert path.read_bytes()[:4] == bytes([0x1A, 0x45, 0xDF, 0xA3])  # EBML header of WebM
     assert seen[-1].progress == 1.0
     assert job.job_id in [j.job_id for j in client.jobs.list(subject=scenario.scenario_id)]
 
 
-def test_a_cancelled_job_says_so(client, held_videos):
+def test_waiting_for_a_cancelled_job_raises(client, held_videos):
     job = client.jobs.export_video(scene="tiny", camera="front", width=64)
     job.cancel()
 
@@ -158,7 +158,7 @@ def test_unknown_jobs_and_assets_are_not_found(client):
         client.assets.get("nothing")
 
 
-def test_the_async_twin_does_the_same(worker, tmp_path):
+def test_the_async_client_has_the_same_handles(worker, tmp_path):
     async def work():
         async with real2sim.connect_async(worker.url) as client:
             scenario = await client.scenarios.create(scene="tiny")

@@ -43,13 +43,13 @@ def test_a_running_worker_is_ready_and_stops_with_the_block(make_settings):
         httpx2.get(f"{url}/livez")
 
 
-def test_it_stops_although_the_block_raises(make_settings):
+def test_a_worker_stops_if_its_block_raises(make_settings):
     with pytest.raises(KeyError), running_worker(make_settings()) as running:
         raise KeyError
     assert not running.worker.engine.alive
 
 
-def test_two_workers_take_two_ports(make_settings, tmp_path):
+def test_two_workers_use_different_ports(make_settings, tmp_path):
     with (
         running_worker(make_settings()) as first,
         running_worker(make_settings(data_dir=tmp_path / "other", worker_id="w1")) as second,
@@ -58,14 +58,14 @@ def test_two_workers_take_two_ports(make_settings, tmp_path):
     assert names == ["w0", "w1"]
 
 
-def test_the_token_is_handed_on(make_settings):
+def test_a_running_worker_exposes_its_token(make_settings):
     with running_worker(make_settings(token="correct horse")) as running:
         headers = {"Authorization": f"Bearer {running.token}"}
         assert httpx2.get(f"{running.url}/v1/server").status_code == 401
         assert httpx2.get(f"{running.url}/v1/server", headers=headers).status_code == 200
 
 
-def test_a_worker_that_does_not_get_ready_says_why(make_settings, monkeypatch):
+def test_a_worker_that_does_not_become_ready_raises_with_the_reason(make_settings, monkeypatch):
     warm, now, ask = threading.Event(), [0.0], serve_module._ask_readiness
 
     def ask_until_told(address, *, timeout_s: float) -> tuple[bool, str]:
@@ -86,7 +86,7 @@ def test_a_worker_that_does_not_get_ready_says_why(make_settings, monkeypatch):
         pass
 
 
-def test_a_worker_that_cannot_start_says_why_at_once(make_settings, tmp_path):
+def test_a_worker_that_cannot_start_raises_immediately_with_the_reason(make_settings, tmp_path):
     (tmp_path / "data").write_text("in the way")
     with (
         pytest.raises(RuntimeError, match="ended while it started: the state folder"),
@@ -95,7 +95,7 @@ def test_a_worker_that_cannot_start_says_why_at_once(make_settings, tmp_path):
         pass
 
 
-def test_an_open_address_without_a_token_is_refused_before_anything_starts(make_settings):
+def test_a_public_address_without_a_token_is_refused_before_the_start(make_settings):
     settings = make_settings(host="0.0.0.0")
     with pytest.raises(OpenBindError):
         run(settings)
@@ -105,14 +105,14 @@ def test_an_open_address_without_a_token_is_refused_before_anything_starts(make_
 
 @pytest.fixture
 def taken_port() -> Iterator[int]:
-    """A port that another program listens on."""
+    """A port in use by another program."""
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         yield taken.getsockname()[1]
 
 
-def test_a_port_that_is_taken_is_refused(make_settings, taken_port):
+def test_a_port_in_use_is_refused(make_settings, taken_port):
     with (
         pytest.raises(AddressError, match="in use"),
         running_worker(make_settings(port=taken_port)),
@@ -120,7 +120,7 @@ def test_a_port_that_is_taken_is_refused(make_settings, taken_port):
         pass
 
 
-def test_a_taken_port_is_refused_with_port_and_remedy_before_the_worker_is_loaded(taken_port):
+def test_the_command_refuses_a_port_in_use_before_loading_the_worker(taken_port):
     code = (
         "import sys\n"
         "from real2sim_server.cli.serve import serve\n"
@@ -137,28 +137,26 @@ def test_a_taken_port_is_refused_with_port_and_remedy_before_the_worker_is_loade
     assert heavy == "False"
 
 
-def test_an_address_of_another_machine_is_refused_with_the_remedy(make_settings):
+def test_a_foreign_address_is_refused_with_a_hint(make_settings):
     with pytest.raises(AddressError, match="--host"):
         check_start(make_settings(host="192.0.2.1"))
 
 
 @pytest.mark.parametrize("start", [check_start, run])
-def test_a_missing_scene_folder_is_refused_with_its_path_and_the_remedy(
-    make_settings, tmp_path, start
-):
+def test_a_missing_scene_folder_is_refused_with_its_path_and_a_hint(make_settings, tmp_path, start):
     missing = tmp_path / "missing"
     with pytest.raises(SceneFolderError, match="mkdir -p") as refused:
         start(make_settings(scenes_dir=missing))
     assert str(missing) in str(refused.value)
 
 
-def test_no_worker_runs_without_the_scene_folder_it_is_given(make_settings, tmp_path):
+def test_a_worker_with_a_missing_scene_folder_does_not_start(make_settings, tmp_path):
     settings = make_settings(scenes_dir=tmp_path / "missing")
     with pytest.raises(SceneFolderError), running_worker(settings):
         pass
 
 
-def test_a_file_is_no_scene_folder(make_settings, tmp_path):
+def test_a_file_as_scene_folder_is_refused(make_settings, tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(SceneFolderError, match="not a folder"):
         check_start(make_settings(scenes_dir=tmp_path / "file"))
@@ -168,7 +166,7 @@ def test_the_default_scene_folder_may_be_missing(make_settings):
     check_start(make_settings(scenes_dir=None))
 
 
-def test_sockets_are_not_compressed_and_messages_are_limited(make_settings):
+def test_sockets_are_uncompressed_and_messages_are_limited(make_settings):
     from real2sim_proto.codec import MAX_CLIENT_MESSAGE_BYTES
 
     config = server_config(create_app(make_settings()), make_settings())
@@ -176,7 +174,7 @@ def test_sockets_are_not_compressed_and_messages_are_limited(make_settings):
     assert config.ws_max_size == MAX_CLIENT_MESSAGE_BYTES
 
 
-def test_a_render_of_a_client_that_left_is_not_drawn(make_settings):
+def test_a_queued_render_is_dropped_when_its_client_disconnects(make_settings):
     with running_worker(make_settings()) as running:
         engine, blocked, go_on = running.worker.engine, threading.Event(), threading.Event()
 
@@ -200,7 +198,7 @@ def test_a_render_of_a_client_that_left_is_not_drawn(make_settings):
             blocker.join()
 
 
-def test_a_worker_process_tells_its_url_logs_json_and_ends_cleanly_at_sigterm(
+def test_a_worker_process_prints_its_url_logs_json_and_exits_cleanly_on_sigterm(
     make_settings, tmp_path
 ):
     settings = make_settings(log_level="info")
@@ -224,7 +222,7 @@ def test_a_worker_process_tells_its_url_logs_json_and_ends_cleanly_at_sigterm(
     assert requests[0]["request_id"] == answer.headers["X-Request-Id"]
 
 
-def test_at_sigterm_a_worker_serves_on_not_ready_until_a_second_signal(make_settings):
+def test_sigterm_drains_a_worker_until_a_second_signal(make_settings):
     settings = make_settings(drain_seconds=600)
     app = create_app(settings)
     listener = bind("127.0.0.1", 0)
@@ -247,8 +245,8 @@ def test_at_sigterm_a_worker_serves_on_not_ready_until_a_second_signal(make_sett
     assert not thread.is_alive()
 
 
-def test_answers_do_not_wait_for_acknowledgements():
-    """With Nagle's algorithm the second part of an answer would."""
+def test_nagles_algorithm_is_disabled():
+    """Otherwise the second part of a response waits for an acknowledgement."""
 
     async def is_sent_at_once() -> int:
         listener, found = bind("127.0.0.1", 0), asyncio.get_running_loop().create_future()

@@ -11,7 +11,7 @@ def test_server_publishes_versions_limits_and_conventions(start_worker):
     assert info.conventions == CONVENTIONS
 
 
-def test_server_says_what_draws_and_why(client):
+def test_server_reports_the_backend_and_the_reason(client):
     device = client.get("/v1/server").json()["device"]
     assert device["backend"] == "cpu"
     assert "REAL2SIM_BACKEND" in device["reason"]

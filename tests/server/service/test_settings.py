@@ -8,7 +8,7 @@ from pydantic import ValidationError
 from real2sim_server.settings import Settings
 
 
-def test_the_environment_sets_what_is_not_given(monkeypatch):
+def test_environment_variables_set_missing_values(monkeypatch):
     monkeypatch.setenv("REAL2SIM_PORT", "9000")
     monkeypatch.setenv("REAL2SIM_TOKEN", "correct horse")
     settings = Settings(worker_id="w3")
@@ -17,7 +17,7 @@ def test_the_environment_sets_what_is_not_given(monkeypatch):
 
 
 @pytest.mark.parametrize("end", ["\r", "\r\n", " \n"])
-def test_a_token_loses_the_end_of_its_line(monkeypatch, tmp_path, end):
+def test_the_line_ending_of_a_token_is_stripped(monkeypatch, tmp_path, end):
     monkeypatch.setenv("REAL2SIM_TOKEN", "correct horse" + end)
     assert Settings().token.get_secret_value() == "correct horse"
     monkeypatch.delenv("REAL2SIM_TOKEN")
@@ -26,7 +26,7 @@ def test_a_token_loses_the_end_of_its_line(monkeypatch, tmp_path, end):
     assert found.get_secret_value() == "correct horse"
 
 
-def test_a_token_that_no_header_can_hold_is_refused_without_showing_it():
+def test_a_token_that_is_not_a_valid_header_is_refused_without_revealing_it():
     with pytest.raises(
         ValidationError, match=r"token\n.*character 8 of the token is U\+000D"
     ) as error:
@@ -34,18 +34,18 @@ def test_a_token_that_no_header_can_hold_is_refused_without_showing_it():
     assert "horse" not in str(error.value)
 
 
-def test_the_token_is_not_shown():
+def test_the_repr_does_not_reveal_the_token():
     assert "correct" not in repr(Settings(token="correct horse"))
 
 
-def test_folders_and_store_lie_below_the_data_folder_by_default():
+def test_folders_and_store_are_below_the_data_folder_by_default():
     settings = Settings(data_dir=Path("/x"))
     assert settings.scenes_path == Path("/x/scenes")
     assert settings.import_path == Path("/x/import")
     assert settings.database_url == "sqlite:////x/real2sim.db"
 
 
-def test_listening_beyond_this_machine_is_not_the_default():
+def test_the_default_host_is_loopback():
     assert Settings().host == "127.0.0.1"
 
 
@@ -53,6 +53,6 @@ def test_listening_beyond_this_machine_is_not_the_default():
     "wrong",
     [{"worker_id": "worker 1"}, {"port": 70000}, {"token": "short"}, {"backend": "vulkan"}],
 )
-def test_values_that_cannot_be_are_refused(wrong):
+def test_invalid_values_are_refused(wrong):
     with pytest.raises(ValidationError):
         Settings(**wrong)

@@ -1,4 +1,4 @@
-"""What the holder of a token may do, how many jobs they may have, and what is on record of it."""
+"""Roles of token holders, their job limits, and the audit log."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def tokens_file(tmp_path):
 
 @pytest.fixture
 def site(start_worker, tokens_file):
-    """A worker, and a token of each role."""
+    """A worker, and a token for each role."""
     tokens = {role: add_token(tokens_file, role, TokenLimits(), role=role) for role in ROLES}
     return start_worker(tokens_file=tokens_file), tokens
 
@@ -47,7 +47,7 @@ CALLS = {
 
 
 @pytest.mark.parametrize("role", ROLES)
-def test_a_role_may_what_it_may_and_nothing_beyond(site, role):
+def test_each_role_allows_exactly_its_calls(site, role):
     client, tokens = site
     for needed, calls in CALLS.items():
         for method, path, body in calls:
@@ -60,7 +60,7 @@ def test_a_role_may_what_it_may_and_nothing_beyond(site, role):
                 assert f"--role {needed}" in answer.json()["hint"]
 
 
-def test_every_route_needs_a_role_of_its_own(client):
+def test_routes_require_the_expected_roles(client):
     paths = client.get("/openapi.json").json()["paths"]
     needed = {
         (method.upper(), path): needed_role(method.upper(), path)
@@ -78,18 +78,18 @@ def test_every_route_needs_a_role_of_its_own(client):
     assert all(path.startswith(("/v1/sessions", "/v1/sweeps")) for path in driven)
 
 
-def test_a_driver_may_not_take_the_socket_of_a_session_with_a_token_that_observes(site):
+def test_an_observer_token_cannot_reset_a_session(site):
     client, tokens = site
     made = client.post("/v1/sessions?scene=tiny", json={}, headers=bearer(tokens["drive"])).json()
     path = f"/v1/sessions/{made['session_id']}"
     assert client.get(f"{path}/state", headers=bearer(tokens["observe"])).status_code != 403
     refused = client.post(f"{path}/reset", json={}, headers=bearer(tokens["observe"]))
     assert (refused.status_code, refused.json()["code"]) == (403, "FORBIDDEN")
-    # The session's own token is that of whoever made it.
+    # The session's own token has the role of its creator.
     assert client.post(f"{path}/reset", json={}, headers=bearer(made["token"])).status_code == 200
 
 
-def test_a_token_of_before_there_were_roles_may_everything(tokens_file):
+def test_a_token_without_a_role_administers(tokens_file):
     add_token(tokens_file, "old", TokenLimits())
     text = json.loads(tokens_file.read_text())
     del text["tokens"][0]["role"]
@@ -111,7 +111,7 @@ def test_jobs_of_a_token_are_limited(start_worker, tokens_file, held_videos):
     assert client.post("/v1/exports", json=VIDEO, headers=bearer(alice)).status_code == 202
 
 
-def test_who_changed_something_and_who_was_refused_is_on_record(site, tmp_path, capsys):
+def test_changes_and_refusals_are_in_the_audit_log(site, tmp_path, capsys):
     client, tokens = site
     client.get("/v1/scenes", headers=bearer(tokens["observe"]))
     made = client.post(
@@ -137,7 +137,7 @@ def test_who_changed_something_and_who_was_refused_is_on_record(site, tmp_path, 
     assert len(capsys.readouterr().out.splitlines()) == 1
 
 
-def test_entries_wait_while_the_store_is_in_trouble(client, monkeypatch):
+def test_audit_entries_are_kept_until_the_store_recovers(client, monkeypatch):
     worker = client.app.state.worker
     add = worker.audit._log.add
 

@@ -1,4 +1,4 @@
-"""Spans of requests and of the engine, as a collector would get them."""
+"""Spans of requests and engine jobs, as a collector receives them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PARENT = "00-0af7651916cd43dd8448eb211c80319c-b7ad6b7169203331-01"
 
 @pytest.fixture
 def spans(make_settings):
-    """A worker that is traced, and what it has told."""
+    """A traced worker and its exporter."""
     from fastapi.testclient import TestClient
     from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanExporter
 
@@ -33,7 +33,7 @@ def spans(make_settings):
     provider.shutdown()
 
 
-def test_a_request_and_its_work_on_the_engine_continue_the_callers_trace(spans):
+def test_request_and_engine_spans_continue_the_trace_of_the_caller(spans):
     client, exporter = spans
     path = "/v1/scenes/tiny/render?width=64"
     assert client.get(path, headers={"traceparent": PARENT}).status_code == 200
@@ -48,23 +48,23 @@ def test_a_request_and_its_work_on_the_engine_continue_the_callers_trace(spans):
     assert engine
     assert {span.parent.span_id for span in engine} == {request.context.span_id}
     assert all(span.start_time <= span.end_time for span in engine)
-    # A call without one begins a trace of its own.
+    # A request without a parent starts a new trace.
     assert found["GET /v1/scenes"].context.trace_id != request.context.trace_id
 
 
-def test_health_leaves_no_spans(spans):
+def test_health_and_metrics_produce_no_spans(spans):
     client, exporter = spans
     client.get("/livez")
     client.get("/metrics")
     assert exporter.get_finished_spans() == ()
 
 
-def test_a_worker_that_is_not_traced_never_loads_what_traces(client):
+def test_an_untraced_worker_has_no_tracing_hook(client):
     assert client.app.state.worker.engine.on_queued is None
 
 
 @pytest.mark.network
-def test_the_proxy_begins_a_trace_where_there_is_none(site):  # noqa: F811
+def test_the_proxy_starts_a_trace_if_there_is_none(site):  # noqa: F811
     seen: list[str] = []
     web = site.stands["w0"].web.RequestHandlerClass
     plain = web.do_GET

@@ -28,11 +28,11 @@ def test_only_ilqr_plans_ahead():
     assert [t for t in trackers if plans_ahead(EgoSpec(tracker=t))] == ["ilqr"]
 
 
-def test_episodes_with_other_trackers_wait_for_nothing():
+def test_episodes_with_other_trackers_do_not_wait_for_kernels():
     asyncio.run(KernelWarmUp().ready(episode("lqr")))
 
 
-def test_an_episode_whose_tracker_plans_ahead_waits_for_its_kernels(monkeypatch):
+def test_an_episode_with_a_planning_tracker_waits_for_its_kernels(monkeypatch):
     monkeypatch.setattr(warm_up, "planning_on_disk", lambda: True)
     ended, begun, go_on = [], threading.Event(), threading.Event()
 
@@ -61,7 +61,7 @@ def test_an_episode_whose_tracker_plans_ahead_waits_for_its_kernels(monkeypatch)
 
 
 @pytest.mark.parametrize("part", ["run", "run_planning"])
-def test_where_kernels_fail_nobody_waits_for_them(monkeypatch, part):
+def test_episodes_do_not_wait_for_kernels_that_failed(monkeypatch, part):
     def fail() -> None:
         raise RuntimeError("no compiler")
 
@@ -79,7 +79,7 @@ def test_where_kernels_fail_nobody_waits_for_them(monkeypatch, part):
     asyncio.run(failed())
 
 
-def test_kernels_of_deformation_are_made_from_the_first_episode_on_that_may_need_them(monkeypatch):
+def test_deformation_kernels_are_compiled_on_the_first_episode_that_may_need_them(monkeypatch):
     made = []
     monkeypatch.setattr(warm_up, "deformation_on_disk", lambda: True)
     monkeypatch.setattr(warm_up, "warm_up_deformation", lambda: made.append("kernels"))
@@ -107,7 +107,7 @@ def test_kernels_of_deformation_are_made_from_the_first_episode_on_that_may_need
     assert made == ["kernels"]
 
 
-def test_where_kernels_of_deformation_fail_images_are_drawn_all_the_same(monkeypatch):
+def test_images_are_rendered_if_deformation_kernels_fail(monkeypatch):
     def fail() -> None:
         raise RuntimeError("no compiler")
 
@@ -122,7 +122,7 @@ def test_where_kernels_of_deformation_fail_images_are_drawn_all_the_same(monkeyp
     assert asyncio.run(wait())
 
 
-def test_on_the_first_run_another_process_compiles_beside_the_renderer(monkeypatch, tmp_path):
+def test_the_first_run_compiles_in_a_second_process(monkeypatch, tmp_path):
     monkeypatch.setattr(warm_up, "kernels_on_disk", lambda: False)
     monkeypatch.setattr(warm_up, "warm_up_world", lambda: None)
     left = tmp_path / "left"
@@ -133,7 +133,7 @@ def test_on_the_first_run_another_process_compiles_beside_the_renderer(monkeypat
     assert left.read_text() == "done"
 
 
-def test_kernels_that_the_other_process_has_made_ready_count(monkeypatch):
+def test_progress_includes_kernels_compiled_by_the_second_process(monkeypatch):
     program = "import sys; print('1 28'); print('2 28', flush=True); sys.stdin.read()"
     monkeypatch.setattr(preflight, "_PROGRAM", program)
     monkeypatch.setattr(warm_up, "kernels_on_disk", lambda: False)
@@ -150,16 +150,14 @@ def test_kernels_that_the_other_process_has_made_ready_count(monkeypatch):
     assert told == ["compiling kernels, on the first run only: 5 of 40"]
 
 
-def test_the_other_process_tells_how_many_it_has_made_ready(worker_kernels):
+def test_the_second_process_reports_its_compiled_kernels(worker_kernels):
     process = preflight.compile_in_background("warm_up")
     written, _ = process.communicate(timeout=LIMIT_S)
     assert written.split()[-2:] == [b"28", b"28"]
 
 
 @pytest.mark.parametrize("kept", [[], ["world/entries.advance_vehicle-69.py311.nbi"]])
-def test_compiling_begins_before_libraries_are_loaded_where_nothing_is_kept(
-    monkeypatch, tmp_path, kept
-):
+def test_compilation_starts_before_imports_if_no_kernels_are_cached(monkeypatch, tmp_path, kept):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     monkeypatch.setattr(preflight, "_PROGRAM", "")
     for name in kept:
@@ -175,12 +173,12 @@ def test_compiling_begins_before_libraries_are_loaded_where_nothing_is_kept(
         assert process.returncode == 0
 
 
-def test_what_names_the_kernel_on_disk_names_it_as_numba_does():
+def test_the_cache_file_pattern_matches_numbas_name():
     index = advance_vehicle._cache._impl.filename_base
     assert fnmatch(f"{index}.py311.nbi", preflight.KEPT)
 
 
-def test_a_worker_that_ends_early_takes_the_second_process_with_it(monkeypatch):
+def test_a_worker_that_stops_early_terminates_the_second_process(monkeypatch):
     monkeypatch.setattr(preflight, "_PROGRAM", "import time; time.sleep(3600)")
     process = preflight.compile_in_background("warm_up")
     monkeypatch.setattr(preflight, "_begun", [process])

@@ -1,4 +1,4 @@
-"""What tests of workers wait for."""
+"""Waits for tests of workers."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ def is_ready(client: TestClient) -> bool:
 
 
 def wait_ready(client: TestClient) -> None:
-    """Return once the worker takes work."""
+    """Wait until the worker is ready."""
     wait_until(lambda: is_ready(client), lambda: f"a worker: {client.get('/readyz').text}")
 
 
 def finished(client: TestClient, job: Any) -> dict:
-    """A job once it is over.
+    """A job once it has ended.
 
     Args:
-        client: of any worker that knows it.
-        job: its path, or the answer that started it.
+        client: client of any worker that knows the job.
+        job: its path, or the response that started it.
     """
     if not isinstance(job, str):
         assert job.status_code == 202, job.text
@@ -34,22 +34,22 @@ def finished(client: TestClient, job: Any) -> dict:
 
 
 def succeeded(client: TestClient, job: Any) -> dict:
-    """:func:`finished` of a job that must succeed."""
+    """:func:`finished` for a job that must succeed."""
     ended = finished(client, job)
     assert ended["state"] == "succeeded", ended
     return ended
 
 
 def accepted(send: Callable[[], Any]) -> Any:
-    """The answer to a request, sent again while the worker says that it may be.
+    """The response to a request, repeated while the worker says that it can be retried.
 
-    On a busy machine a healthy database may miss the short time limit of a worker under test.
+    On a busy machine even a healthy database can exceed the short time limit of a test worker.
     """
     return wait_until(lambda: _unless_retryable(send()), lambda: f"a success: {send().text}")
 
 
 def _if_over(job: dict) -> dict | None:
-    # An error document, where the store is in trouble, is not a job.
+    # If the store has failed, the body is a problem document, not a job.
     return job if "job_id" in job and JobInfo.model_validate(job).over else None
 
 

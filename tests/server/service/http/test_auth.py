@@ -23,7 +23,7 @@ def test_health_is_open(guarded, path):
 
 
 @pytest.mark.parametrize("path", ["/v1/server", "/v1/scenes", "/v1/scenarios", "/metrics"])
-def test_everything_else_wants_the_token(guarded, path):
+def test_all_other_routes_require_the_token(guarded, path):
     response = guarded.get(path)
     assert response.status_code == 401
     assert response.json()["code"] == ErrorCode.UNAUTHORIZED
@@ -34,22 +34,22 @@ def test_everything_else_wants_the_token(guarded, path):
 @pytest.mark.parametrize(
     "header", ["Bearer wrong", "Bearer", "Basic Y29ycmVjdA==", f"Bearer {TOKEN}x", "Bearer \u00e9"]
 )
-def test_anything_but_the_token_is_refused(guarded, header):
+def test_any_other_credential_is_refused(guarded, header):
     headers = {"Authorization": header.encode("latin-1")}
     assert guarded.get("/v1/server", headers=headers).status_code == 401
 
 
-def test_without_a_token_of_its_own_the_worker_asks_for_none(client):
+def test_a_worker_without_a_token_requires_no_authentication(client):
     assert client.get("/v1/server").status_code == 200
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "127.8.8.8", "::1", "localhost"])
-def test_this_machine_may_be_listened_on_without_a_token(host):
+def test_loopback_addresses_need_no_token(host):
     check_bind(host, None)
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.168.1.7", "worker.example", ""])
-def test_any_other_address_is_refused_without_a_token(host):
+def test_other_addresses_require_a_token(host):
     with pytest.raises(OpenBindError, match="REAL2SIM_TOKEN"):
         check_bind(host, None)
     check_bind(host, TOKEN)

@@ -7,7 +7,7 @@ import pytest
 from real2sim_server.service.http.responses import uncancellable
 
 
-def test_a_change_goes_to_its_end_when_its_caller_is_cancelled():
+def test_an_uncancellable_change_completes_when_its_caller_is_cancelled():
     async def work() -> list[str]:
         done: list[str] = []
         begun, go_on = asyncio.Event(), asyncio.Event()
@@ -31,7 +31,7 @@ def test_a_change_goes_to_its_end_when_its_caller_is_cancelled():
     assert asyncio.run(work()) == ["changed"]
 
 
-def test_answers_and_errors_come_through():
+def test_results_and_exceptions_are_passed_through():
     @uncancellable
     async def divided(a: float, b: float) -> float:
         return a / b

@@ -26,7 +26,7 @@ def test_an_edit_sent_twice_takes_effect_once_and_gets_the_same_answer(client, u
     assert client.get(url).json()["revision"] == 1
 
 
-def test_a_creation_sent_twice_makes_one_scenario(client):
+def test_a_creation_sent_twice_creates_one_scenario(client):
     answers = [client.post("/v1/scenarios", json={"scene": "tiny"}, headers=KEY) for _ in "ab"]
     assert [a.status_code for a in answers] == [201, 201]
     assert answers[0].headers["Location"] == answers[1].headers["Location"]
@@ -45,7 +45,7 @@ def test_undo_and_redo_sent_twice_take_effect_once(client, url, name):
         assert client.post(f"{url}/{name}", headers=KEY).json()["revision"] == before + 1
 
 
-def test_the_key_of_another_request_is_refused(client, url):
+def test_a_key_used_by_a_different_request_is_refused(client, url):
     client.post(f"{url}/operations", json=MOVE, headers=KEY)
     other = {"operations": [MOVE["operations"][0] | {"x": 2.0}]}
     problem = client.post(f"{url}/operations", json=other, headers=KEY)
@@ -55,12 +55,12 @@ def test_the_key_of_another_request_is_refused(client, url):
     assert stale.json()["code"] == ErrorCode.IDEMPOTENCY_CONFLICT
 
 
-def test_the_same_key_at_another_call_is_another_request(client, url):
+def test_the_same_key_can_be_used_on_different_routes(client, url):
     assert client.post(f"{url}/operations", json=MOVE, headers=KEY).json()["revision"] == 1
     assert client.post(f"{url}/undo", headers=KEY).json()["revision"] == 2
 
 
-def test_a_refused_request_may_be_sent_again(client, url):
+def test_a_refused_request_can_be_retried_with_the_same_key(client, url):
     unknown = {"operations": [{"op": "restore", "object_id": "twin"}]}
     assert client.post(f"{url}/operations", json=unknown, headers=KEY).status_code == 404
     copy = {"operations": [{"op": "duplicate", "object_id": "post", "new_id": "twin"}]}
@@ -69,14 +69,14 @@ def test_a_refused_request_may_be_sent_again(client, url):
     assert client.post(f"{url}/operations", json=unknown, headers=KEY).status_code == 200
 
 
-def test_a_dry_run_is_not_remembered(client, url):
+def test_dry_runs_are_not_stored(client, url):
     for expected in (0, 1):
         answer = client.post(f"{url}/operations", json=MOVE | {"dry_run": True}, headers=KEY)
         assert answer.json()["revision"] == expected
         client.post(f"{url}/operations", json=MOVE)
 
 
-def test_answers_are_remembered_over_a_restart(start_worker, run_worker):
+def test_stored_answers_survive_a_restart(start_worker, run_worker):
     with run_worker() as first:
         url = first.post("/v1/scenarios", json={"scene": "tiny"}).headers["Location"]
         answer = first.post(f"{url}/operations", json=MOVE, headers=KEY)
@@ -85,7 +85,7 @@ def test_answers_are_remembered_over_a_restart(start_worker, run_worker):
     assert second.get(url).json()["revision"] == 1
 
 
-def test_requests_that_arrive_together_under_one_key_take_effect_once(client, url):
+def test_concurrent_requests_with_one_key_take_effect_once(client, url):
     with ThreadPoolExecutor(8) as pool:
         answers = list(
             pool.map(
@@ -96,7 +96,7 @@ def test_requests_that_arrive_together_under_one_key_take_effect_once(client, ur
     assert client.get(url).json()["revision"] == 1
 
 
-def test_a_key_that_is_too_long_is_refused(client, url):
+def test_a_key_over_the_length_limit_is_refused(client, url):
     headers = {"Idempotency-Key": "k" * 201}
     problem = client.post(f"{url}/undo", headers=headers).json()
     assert problem["code"] == ErrorCode.INVALID_REQUEST
@@ -107,14 +107,14 @@ def test_a_key_that_is_too_long_is_refused(client, url):
 
 @pytest.fixture
 def session(client) -> dict:
-    """The path of a session whose episode has begun, and the headers that open it."""
+    """Path of a session with a started episode, and its authorization headers."""
     body = {"reset": {"seed": 0, "dt_us": 50_000, "action": "control"}}
     info = client.post("/v1/sessions?scene=tiny", json=body).json()
     token = {"Authorization": f"Bearer {info['token']}"}
     return {"path": f"/v1/sessions/{info['session_id']}", "token": token, "info": info}
 
 
-def test_a_step_sent_twice_moves_the_clock_once(client, session):
+def test_a_step_sent_twice_advances_the_clock_once(client, session):
     first, second = (
         client.post(f"{session['path']}/step", json={"n": 3}, headers=session["token"] | KEY)
         for _ in "ab"
@@ -125,7 +125,7 @@ def test_a_step_sent_twice_moves_the_clock_once(client, session):
     assert state.json()["step"] == first.json()["step"] == 3
 
 
-def test_a_reset_sent_twice_begins_one_episode(client, session):
+def test_a_reset_sent_twice_starts_one_episode(client, session):
     headers = session["token"] | KEY
     client.post(f"{session['path']}/reset", json={"seed": 5}, headers=headers)
     client.post(f"{session['path']}/step", json={"n": 2}, headers=session["token"])
@@ -134,7 +134,7 @@ def test_a_reset_sent_twice_begins_one_episode(client, session):
     assert state.json()["step"] == 2
 
 
-def test_a_fork_sent_twice_makes_one_session(client, session):
+def test_a_fork_sent_twice_creates_one_session(client, session):
     headers = session["token"] | KEY
     answers = [client.post(f"{session['path']}/fork", headers=headers) for _ in "ab"]
     assert [a.status_code for a in answers] == [201, 201]
@@ -142,7 +142,7 @@ def test_a_fork_sent_twice_makes_one_session(client, session):
     assert len(client.get("/v1/sessions").json()["sessions"]) == 2
 
 
-def test_an_answer_to_a_step_survives_a_restart_with_the_step(run_worker):
+def test_the_stored_answer_of_a_step_survives_a_restart(run_worker):
     with run_worker() as client:
         info = client.post("/v1/sessions?scene=tiny", json={"reset": {}}).json()
         path = f"/v1/sessions/{info['session_id']}"
@@ -154,7 +154,7 @@ def test_an_answer_to_a_step_survives_a_restart_with_the_step(run_worker):
         assert again.headers["Idempotent-Replayed"] == "true"
 
 
-def test_a_step_that_cannot_be_stored_moves_nothing(client, session, monkeypatch):
+def test_a_step_that_cannot_be_stored_does_not_advance_the_session(client, session, monkeypatch):
     store = client.app.state.worker.store
 
     async def fail(*_args, **_kwargs):
@@ -167,7 +167,7 @@ def test_a_step_that_cannot_be_stored_moves_nothing(client, session, monkeypatch
     assert client.post(f"{session['path']}/step", **request).json()["step"] == 30
 
 
-def test_an_asset_cut_out_twice_is_one_asset(client):
+def test_an_asset_cut_sent_twice_creates_one_asset(client):
     cut = {"scene": "tiny", "object_id": "car_red", "asset_id": "red"}
     answers = [client.post("/v1/assets", json=cut, headers=KEY) for _ in "ab"]
     assert [a.status_code for a in answers] == [201, 201]
@@ -176,7 +176,7 @@ def test_an_asset_cut_out_twice_is_one_asset(client):
 
 
 @pytest.mark.parametrize(("path", "name"), [("/v1/assets", "assets"), ("/v1/scenes", "scenes")])
-def test_an_upload_sent_twice_with_other_boundaries_takes_effect_once(
+def test_an_upload_sent_twice_with_different_boundaries_takes_effect_once(
     client, tmp_path, tiny_scene, path, name
 ):
     write_splats(tiny_scene.objects["car_red"].cloud, tmp_path / "car.ply")
@@ -193,7 +193,7 @@ def test_an_upload_sent_twice_with_other_boundaries_takes_effect_once(
 # --- a crash between files and their answer -------------------------------------------------------
 
 
-def test_what_a_crash_left_without_its_answer_is_known_by_its_request(
+def test_a_request_interrupted_before_its_answer_was_stored_can_be_repeated(
     client, tmp_path, tiny_scene, monkeypatch
 ):
     (tmp_path / "import").mkdir()
@@ -214,7 +214,7 @@ def test_what_a_crash_left_without_its_answer_is_known_by_its_request(
         assert again.status_code == 201, again.text
         assert client.get(again.headers["Location"]).status_code == 200
         assert len(client.get(path).json()[path[4:]]) == before + 1
-        # Whoever comes with another key finds the name taken.
+        # A request with another key gets a name conflict.
         other = client.post(path, headers={"Idempotency-Key": f"{key} 2"}, **request)
         assert other.json()["code"] == ErrorCode.ALREADY_EXISTS
     assert not list(tmp_path.rglob(".made_by"))

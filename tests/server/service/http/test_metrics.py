@@ -1,4 +1,4 @@
-"""The histograms that the event loop counts into."""
+"""Histograms that are updated on the event loop."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ SECONDS = (0.0, 0.0005, 0.00051, 0.3, 10.0, 11.0)
 
 
 def exposed(registry: CollectorRegistry) -> list[str]:
-    """Lines of all samples but the time at which the library's metric was made."""
+    """All exposed sample lines except the creation time that the library adds."""
     return [
         line for line in generate_latest(registry).decode().splitlines() if "created" not in line
     ]
 
 
-def test_a_histogram_of_the_loop_is_exposed_like_one_of_the_library():
+def test_loop_histograms_are_exposed_like_library_histograms():
     ours, theirs = CollectorRegistry(), CollectorRegistry()
     histogram = LoopHistogram("a_seconds", "text", "stage", buckets=FAST_BUCKETS, registry=ours)
     other = Histogram("a_seconds", "text", ("stage",), buckets=FAST_BUCKETS, registry=theirs)
@@ -28,7 +28,7 @@ def test_a_histogram_of_the_loop_is_exposed_like_one_of_the_library():
     assert exposed(ours) == exposed(theirs)
 
 
-def test_a_histogram_without_a_label_is_there_before_anything_is_counted():
+def test_a_histogram_without_labels_is_exposed_before_any_observation():
     ours, theirs = CollectorRegistry(), CollectorRegistry()
     LoopHistogram("a_seconds", "text", buckets=FAST_BUCKETS, registry=ours).labels()
     Histogram("a_seconds", "text", buckets=FAST_BUCKETS, registry=theirs)

@@ -40,13 +40,13 @@ def made(tmp_path_factory) -> dict[str, Any]:
     return published(create_app(Settings(data_dir=tmp_path_factory.mktemp("openapi"))))
 
 
-def test_routes_changed_only_together_with_the_recorded_contract(made):
+def test_the_openapi_document_matches_the_recorded_hash(made):
     digest = hashlib.sha256(text_of(made).encode()).hexdigest()
     line = f"{digest}  openapi.json"
     assert line in HASHES.read_text().splitlines(), "run `make schema` if it is meant to change"
 
 
-def test_every_operation_is_described_and_has_an_example(made):
+def test_every_operation_has_a_description_and_an_example(made):
     lacking = []
     for path, method, operation in operations(made):
         if not operation.get("description"):
@@ -73,7 +73,7 @@ def test_operation_ids_are_unique_and_errors_are_problem_documents(made):
                 assert "application/problem+json" in content, f"{method} {path} {status}"
 
 
-def test_every_status_is_documented_by_number_with_its_codes(made):
+def test_every_operation_lists_its_statuses_and_error_codes(made):
     for path, method, operation in operations(made):
         assert "default" not in operation["responses"], f"{method} {path}"
         assert {"401", "403", "500", "503"} <= set(operation["responses"]), f"{method} {path}"
@@ -82,12 +82,12 @@ def test_every_status_is_documented_by_number_with_its_codes(made):
     assert "UNKNOWN_SCENARIO" in edit["404"]["description"]
 
 
-def test_errors_are_documented_for_operations_that_exist(made):
+def test_error_codes_are_listed_for_existing_operations_only(made):
     ids = {operation["operationId"] for _, _, operation in operations(made)}
     assert set(OF_OPERATION) <= ids
 
 
-def test_every_post_that_changes_something_takes_an_idempotency_key(made):
+def test_every_changing_post_accepts_an_idempotency_key(made):
     for path, method, operation in operations(made):
         if method == "post" and not path.endswith("/render"):
             names = [parameter["name"] for parameter in operation.get("parameters", ())]
@@ -108,16 +108,16 @@ def test_every_post_that_changes_something_takes_an_idempotency_key(made):
         Storyboard,
     ],
 )
-def test_examples_are_valid(model):
+def test_example_bodies_are_valid(model):
     model.model_validate_json(json.dumps(BODIES[model.__name__]))
 
 
-def test_the_example_of_a_cut_is_valid(made):
+def test_the_asset_cut_example_is_valid(made):
     body = made["paths"]["/v1/assets"]["post"]["requestBody"]["content"]["application/json"]
     AssetCut.model_validate(body["example"])
 
 
-# Answers of these are streams that end with the job, or sockets and pages of other programs.
+# These answer with streams that end with the job, or are sockets and pages of other programs.
 UNFUZZED = ("/events", "/docs", "/ui")
 
 
@@ -126,7 +126,7 @@ BEARER = {"Authorization": f"Bearer {TOKEN}"}
 VALID = {
     "expected-statuses": [200, 201, 202, 204, 304, 404, 406, 409, 410, 412, 413, 422, 429, 501, 503]
 }
-"""What a request that is valid by its schema may get: much can only be known from the scene."""
+"""Statuses allowed for requests that are valid by the schema. Some checks need the scene."""
 
 
 def examples(most: int) -> settings:
@@ -144,9 +144,7 @@ def examples(most: int) -> settings:
 @pytest.mark.parametrize(
     "most", [3, pytest.param(30, marks=[pytest.mark.slow, pytest.mark.timeout(1800)])]
 )
-def test_any_request_gets_a_documented_answer_by_all_checks_and_none_breaks_the_worker(
-    make_settings, made, most
-):
+def test_random_requests_pass_all_schemathesis_checks(make_settings, made, most):
     schemathesis = pytest.importorskip(
         "schemathesis", reason="not installed: pip install 'real2sim[dev]'"
     )
@@ -182,10 +180,10 @@ def test_any_request_gets_a_documented_answer_by_all_checks_and_none_breaks_the_
         pytest.param("worker", 20, marks=[pytest.mark.slow, pytest.mark.timeout(1800)]),
     ],
 )
-def test_any_request_to_what_is_there_gets_a_documented_answer(
+def test_random_requests_on_existing_resources_get_documented_answers(
     make_settings, made, opened_by, most
 ):
-    """Where ids are those of a running session and of a scenario, by either token."""
+    """With ids of a running session and a scenario, and the worker's or session's token."""
     schemathesis = pytest.importorskip(
         "schemathesis", reason="not installed: pip install 'real2sim[dev]'"
     )

@@ -33,23 +33,23 @@ def test_every_code_has_a_status(code):
         (KeyError("secret"), ErrorCode.INTERNAL),
     ],
 )
-def test_errors_of_other_rooms_get_their_code(error, code):
+def test_errors_of_other_modules_are_mapped_to_their_code(error, code):
     assert service_error(error).code is code
 
 
-def test_a_path_that_does_not_exist_is_a_problem(client):
+def test_an_unknown_path_returns_a_problem(client):
     problem = problem_of(client.get("/v1/nothing"))
     assert problem.code is ErrorCode.NOT_FOUND
     assert problem.instance == "/v1/nothing"
 
 
-def test_a_method_that_is_not_allowed_names_those_that_are(client):
+def test_a_method_that_is_not_allowed_returns_the_allowed_methods(client):
     response = client.put("/v1/server")
     assert problem_of(response).code is ErrorCode.METHOD_NOT_ALLOWED
     assert response.headers["Allow"] == "GET, HEAD"
 
 
-def test_bad_json_is_a_problem_that_points_to_the_body(client):
+def test_malformed_json_returns_a_problem_about_the_body(client):
     response = client.post(
         "/v1/scenarios", content=b'{"scene": ', headers={"Content-Type": "application/json"}
     )
@@ -58,7 +58,7 @@ def test_bad_json_is_a_problem_that_points_to_the_body(client):
     assert "not valid JSON" in problem.errors[0].message
 
 
-def test_invalid_values_are_named_by_json_pointers_into_the_body(client):
+def test_invalid_values_are_reported_as_json_pointers_into_the_body(client):
     body = {"operations": [{"op": "translate", "object_id": "a"}, {"op": "scale", "x": -1}]}
     problem = problem_of(client.post("/v1/scenarios/any/operations", json=body))
     assert [e.pointer for e in problem.errors] == ["/operations/1/object_id", "/operations/1/x"]
@@ -69,7 +69,7 @@ def test_unknown_members_are_refused(client):
     assert [e.pointer for e in problem.errors] == ["/sceen"]
 
 
-def test_a_wrong_query_value_is_named(client):
+def test_an_invalid_query_value_is_reported_by_its_pointer(client):
     problem = problem_of(client.get("/v1/scenes/tiny/render?camera=front&width=1"))
     assert [e.pointer for e in problem.errors] == ["/query/width"]
 
@@ -88,9 +88,7 @@ def test_a_body_above_the_limit_is_refused(start_worker, streamed):
     assert "2048" in problem.detail
 
 
-def test_an_unexpected_error_says_nothing_private_and_is_logged_with_its_id(
-    client, monkeypatch, logged
-):
+def test_an_unexpected_error_is_logged_and_hides_private_details(client, monkeypatch, logged):
     async def fail(self):
         raise KeyError("the password is 1234")
 
@@ -103,7 +101,7 @@ def test_an_unexpected_error_says_nothing_private_and_is_logged_with_its_id(
     assert any(isinstance(entry.get("exc_info"), KeyError) for entry in logged)
 
 
-def test_a_full_queue_is_retryable_and_says_when(client, monkeypatch):
+def test_a_full_queue_is_retryable_and_sends_retry_after(client, monkeypatch):
     async def full(*_args, **_kwargs):
         raise QueueFullError("64 jobs wait")
 
@@ -115,14 +113,14 @@ def test_a_full_queue_is_retryable_and_says_when(client, monkeypatch):
     assert int(response.headers["Retry-After"]) >= 1
 
 
-def test_a_request_id_is_taken_over_and_sent_back(client):
+def test_a_request_id_is_echoed(client):
     assert (
         client.get("/livez", headers={"X-Request-Id": "abc-1"}).headers["X-Request-Id"] == "abc-1"
     )
 
 
 @pytest.mark.parametrize("given", ["", "a" * 81, "new line", "<script>"])
-def test_a_request_id_that_could_spoil_logs_is_replaced(client, given):
+def test_an_unsafe_request_id_is_replaced(client, given):
     sent_back = client.get("/livez", headers={"X-Request-Id": given}).headers["X-Request-Id"]
     assert sent_back != given
     assert len(sent_back) == 32

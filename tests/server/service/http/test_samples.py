@@ -1,4 +1,4 @@
-"""The samples of the OpenAPI document, called as they stand, with and without a worker's token."""
+"""The curl samples of the OpenAPI document, run unchanged, with and without a worker token."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from real2sim_server.service.http.openapi import operations, published
 
 TOKEN = "a long enough secret"
 STREAMS = ("jobs-events",)
-"""Answers that last as long as a job."""
+"""Calls whose response lasts as long as a job."""
 ENDS = (
     "sessions-delete",
     "storyboards-remove",
@@ -31,17 +31,17 @@ ENDS = (
     "jobs-cancel",
     "scenes-unload",
 )
-"""Called last: others need what they take away."""
+"""Called last, because they remove what others need."""
 FILES = {"@scenario.xosc": write_openscenario(corner_case("ccrb").storyboard())}
-"""What a caller has beside the shell."""
+"""Files used by the samples."""
 REFUSED = {400, 401, 403, 404, 405, 406, 410, 413, 415, 422}
-"""Statuses that say that the call itself was wrong."""
+"""Statuses that mean that the call itself was invalid."""
 OBJECTS = {"van_0": "car_red", "car_0": "car_blue", "car_3": "car_red", "car_6": "post"}
 
 
 @pytest.fixture(scope="module")
 def demo_street(tiny_scene, tmp_path_factory) -> Path:
-    """A folder with a small scene of the demo's names."""
+    """A scenes folder with a small scene that uses the demo's names."""
     folder = tmp_path_factory.mktemp("scenes")
     named = {
         name: replace(tiny_scene.objects[source], object_id=name)
@@ -56,7 +56,7 @@ def demo_street(tiny_scene, tmp_path_factory) -> Path:
 
 @pytest.fixture
 def client(make_settings, demo_street, tiny_scene, tmp_path, request) -> Any:
-    """A worker on it, with the token of the parameter and a scene to import."""
+    """A worker on that folder, with the parametrized token and a scene to import."""
     save_scene(tiny_scene, tmp_path / "import" / "street.r2s")
     app = create_app(make_settings(scenes_dir=demo_street, token=request.param))
     with TestClient(app, base_url="http://127.0.0.1") as client:
@@ -65,7 +65,7 @@ def client(make_settings, demo_street, tiny_scene, tmp_path, request) -> Any:
 
 @pytest.fixture
 def samples(make_settings) -> dict[str, str]:
-    """Calls by operation, in an order in which they can be made."""
+    """Samples by operation id, in an order in which they can be run."""
     found = {
         o["operationId"]: o["x-codeSamples"][0]["source"] for _, _, o in _operations(make_settings)
     }
@@ -78,7 +78,7 @@ def _operations(make_settings) -> list[tuple[str, str, dict[str, Any]]]:
 
 
 def call(client: TestClient, sample: str, variables: dict[str, str]) -> Any:
-    """Make a call as a shell would."""
+    """Run a sample as a shell would."""
     for name, value in variables.items():
         sample = sample.replace(f"${name}", value)
     words = shlex.split(sample)
@@ -101,7 +101,7 @@ def call(client: TestClient, sample: str, variables: dict[str, str]) -> Any:
 
 
 def prepared(client: TestClient, token: str | None) -> tuple[dict[str, str], dict[str, str]]:
-    """Ids that samples name and those of things that are there; and the shell's variables."""
+    """Map ids in samples to ids that exist. Also returns the shell variables."""
     bearer = {"Authorization": f"Bearer {token}"} if token else {}
     there = {
         "sc_0123456789abcdef": client.post(
@@ -128,7 +128,7 @@ def prepared(client: TestClient, token: str | None) -> tuple[dict[str, str], dic
 
 
 @pytest.mark.parametrize("client", [None, TOKEN], indirect=True, ids=["open", "token"])
-def test_samples_are_answered_as_they_stand(client, samples, request):
+def test_samples_succeed_unchanged(client, samples, request):
     token = request.node.callspec.params["client"]
     there, variables = prepared(client, token)
     refused = {}
@@ -144,14 +144,14 @@ def test_samples_are_answered_as_they_stand(client, samples, request):
 
 
 _EXPECTED: dict[str, set[int]] = {
-    # The sample's file is that of another kind of job, and a video cannot be looked at.
+    # The sample names a file of another job kind, and a video job has no preview.
     "jobs-file": {404},
     "jobs-preview": {404, 422},
 }
 
 
 @pytest.mark.parametrize("client", [None, TOKEN], indirect=True, ids=["open", "token"])
-def test_calls_that_want_a_token_say_so_and_others_do_not_ask(client, make_settings, request):
+def test_the_document_marks_exactly_the_calls_that_require_a_token(client, make_settings, request):
     token = request.node.callspec.params["client"]
     there, _ = prepared(client, token)
     wrong = {}
@@ -167,7 +167,7 @@ def test_calls_that_want_a_token_say_so_and_others_do_not_ask(client, make_setti
     assert wrong == {}
 
 
-def test_the_token_of_a_session_opens_no_other(make_settings, demo_street):
+def test_a_session_token_does_not_open_another_session(make_settings, demo_street):
     with TestClient(create_app(make_settings(scenes_dir=demo_street))) as client:
         client.base_url = "http://127.0.0.1"
         made = [
@@ -181,7 +181,7 @@ def test_the_token_of_a_session_opens_no_other(make_settings, demo_street):
     assert statuses == [200, 401]
 
 
-def test_the_document_says_how_sessions_are_opened(make_settings):
+def test_the_document_describes_session_authentication(make_settings):
     made = published(create_app(make_settings()))
     schemes = made["components"]["securitySchemes"]
     assert set(schemes) == {"WorkerToken", "SessionToken"}

@@ -1,4 +1,4 @@
-"""Messages arrive whole and in order, also at a client that reads late."""
+"""Messages arrive complete and in order, even at a slow reader."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def noise(size: int, seed: int = 0) -> bytes:
 
 
 @pytest.mark.parametrize("deflate", [True, False])
-def test_a_client_that_reads_late_gets_all_messages_in_order(deflate):
+def test_a_slow_reader_receives_all_messages_in_order(deflate):
     messages = [np.random.default_rng(seed).bytes(1_000_000) for seed in range(24)]
 
     async def talk(websocket: WebSocket) -> None:
@@ -76,7 +76,7 @@ def test_a_client_that_reads_late_gets_all_messages_in_order(deflate):
 
 
 @pytest.mark.skipif(not hasattr(socket, "TCP_CONGESTION"), reason="Linux names them")
-def test_what_goes_to_the_same_machine_is_not_paced(monkeypatch):
+def test_loopback_connections_are_not_paced(monkeypatch):
     chosen = []
     made = Connection.connection_made
 

@@ -1,4 +1,4 @@
-"""Calibration over REST: a job that finds what was seen, and says what was not."""
+"""Calibration jobs over REST."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def asked(**changes):
     } | changes
 
 
-def test_boxes_tell_the_speed_of_a_pushed_car_and_nothing_of_its_stiffness(client, scenario):
+def test_boxes_determine_the_speed_of_a_pushed_car_but_not_its_stiffness(client, scenario):
     edit(client, scenario, PUSH)
     body = asked(parameters=["speed", "stiffness"])
     job = finished(client, client.post(f"{scenario}/calibrate", json=body))
@@ -33,7 +33,7 @@ def test_boxes_tell_the_speed_of_a_pushed_car_and_nothing_of_its_stiffness(clien
     assert (result["untold"], result["uncertainty"]["stiffness"]) == (["stiffness"], None)
 
 
-def test_what_observations_do_not_tell_at_all_fails_with_what_to_observe(client, scenario):
+def test_a_parameter_that_no_observation_determines_fails_the_job(client, scenario):
     edit(client, scenario, PUSH)
     body = asked(parameters=["yield_stress"])
     job = finished(client, client.post(f"{scenario}/calibrate", json=body))
@@ -50,7 +50,7 @@ def test_what_observations_do_not_tell_at_all_fails_with_what_to_observe(client,
         ({"observations": {"boxes": [{"t_us": -1, "position": [0, 0, 0]}]}}, "begins at 0 us"),
     ],
 )
-def test_calibrations_that_cannot_be_are_refused_at_once(client, scenario, changes, words):
+def test_invalid_calibrations_are_refused_immediately(client, scenario, changes, words):
     answer = client.post(f"{scenario}/calibrate", json=asked(**changes))
     assert answer.status_code in {404, 422}, answer.text
     assert words in answer.text

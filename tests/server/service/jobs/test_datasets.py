@@ -1,4 +1,4 @@
-"""Data sets by way of the service: one worker for all tests."""
+"""Data set exports through the service. All tests share one worker."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_a_data_set_is_one_archive_with_manifest_and_licence(client, job):
     assert set(json.loads(held["manifest.json"])["files"]) == names
 
 
-def test_a_data_set_leaves_sheets_to_look_at(client, job):
+def test_a_data_set_has_preview_sheets(client, job):
     sheet = file_of(client, job, "preview_0.jpg")
     picture = cv2.imdecode(np.frombuffer(sheet, np.uint8), cv2.IMREAD_COLOR)
     assert picture.shape[1] == 2 * 48
@@ -90,7 +90,7 @@ def test_the_same_request_gives_the_same_bytes(client, job):
     assert file_of(client, again, "dataset.tar") == file_of(client, job, "dataset.tar")
 
 
-def test_a_dry_run_leaves_figures_and_no_file(client):
+def test_a_dry_run_reports_statistics_without_files(client):
     job = succeeded(client, dry_run=True)
     assert (job["result"]["frames"], job["result"]["images"]) == (3, 3)
     assert job["result"]["bytes"] > 0
@@ -116,7 +116,7 @@ def session(client) -> dict:
     return {"id": made["session_id"], "bearer": bearer}
 
 
-def test_the_episode_of_a_session_and_its_recording_give_the_same_bytes(client, session):
+def test_a_session_and_its_recording_export_the_same_bytes(client, session):
     asked = {k: v for k, v in ASKED.items() if k not in {"scene", "end_us"}}
     live = asked | {"session": session["id"]}
     running = finished(client, client.post("/v1/exports", json=live, headers=session["bearer"]))
@@ -129,7 +129,7 @@ def test_the_episode_of_a_session_and_its_recording_give_the_same_bytes(client, 
     assert file_of(client, running, "dataset.tar") == file_of(client, stored, "dataset.tar")
 
 
-def test_a_sweep_is_exported_value_by_value(client):
+def test_a_sweep_exports_one_clip_per_value(client):
     sweep = {
         "parameters": {"gap": {"values": [1.0, 3.0]}},
         "operations": [{"op": "translate", "object_id": "car_blue", "x": "$gap"}],
@@ -139,7 +139,7 @@ def test_a_sweep_is_exported_value_by_value(client):
     assert [clip["values"] for clip in clips.values()] == [{"gap": 1.0}, {"gap": 3.0}]
 
 
-def test_a_session_is_not_exported_without_its_token(client, session):
+def test_exporting_a_session_requires_its_token(client, session):
     asked = {k: v for k, v in ASKED.items() if k != "scene"} | {"session": session["id"]}
     answer = client.post("/v1/exports", json=asked)
     assert (answer.status_code, answer.json()["code"]) == (401, ErrorCode.UNAUTHORIZED)
@@ -158,13 +158,13 @@ def test_a_session_is_not_exported_without_its_token(client, session):
         ({"kind": "film"}, "kind is video (default) or dataset"),
     ],
 )
-def test_a_wrong_data_set_is_refused_at_once(client, change, message):
+def test_an_invalid_data_set_request_is_refused_immediately(client, change, message):
     answer = client.post("/v1/exports", json=ASKED | change)
     assert answer.json()["code"] == ErrorCode.INVALID_REQUEST
     assert message in answer.text
 
 
-def test_fields_that_are_wrong_are_pointed_at_by_their_own_names(client):
+def test_invalid_fields_are_reported_by_name(client):
     answer = client.post("/v1/exports", json=ASKED | {"period_us": 0}).json()
     assert [error["pointer"] for error in answer["errors"]] == ["/period_us"]
 
@@ -176,7 +176,7 @@ def test_a_running_data_set_can_be_cancelled(client):
     assert finished(client, answer)["state"] == "cancelled"
 
 
-def test_more_than_the_disk_may_hold_is_refused_before_it_is_drawn(client):
+def test_a_data_set_over_the_disk_quota_is_refused_before_rendering(client):
     large = {"period_us": 1_000, "end_us": 2_000_000, "width": 480, "formats": ["labels", "kitti"]}
     job = finished(client, client.post("/v1/exports", json=ASKED | large))
     assert job["error"]["code"] == ErrorCode.QUOTA_EXCEEDED

@@ -1,4 +1,4 @@
-"""Jobs of several workers on one store: each is done by one, also where another one died."""
+"""Jobs of several workers on one store. Each job is done once, even if a worker dies."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ def url(request, tmp_path) -> str:
 def quick(monkeypatch):
     monkeypatch.setattr(module, "POLL_S", 0.05)
     monkeypatch.setattr(module, "FOLLOW_S", 0.02)
-    # Jobs that wait are taken where a test says so.
+    # Queued jobs are claimed only when a test allows it.
     monkeypatch.setattr(job_log, "OVERDUE_US", 3_600_000_000)
 
 
 @pytest.fixture
 def fleet(url, tmp_path):
-    """Runs ``work(start)``, where ``start(name)`` gives the jobs of a worker that lives."""
+    """Run ``work(start)``. ``start(name)`` returns the jobs of a live worker."""
 
     def run(work):
         async def inside():
@@ -89,7 +89,7 @@ async def for_ever(context) -> JobResult:
 
 
 async def die(jobs: Jobs) -> None:
-    """What a killed worker leaves: nothing of it moves any more, and its lease runs out."""
+    """Simulate a killed worker: its tasks stop and its lease runs out."""
     jobs._closing = True
     jobs._log.claim_overdue = jobs._log.claim_orphaned = none
     for job in jobs._jobs.values():
@@ -99,7 +99,7 @@ async def die(jobs: Jobs) -> None:
 
 
 async def none(*_given) -> None:
-    """A dead worker takes nothing."""
+    """Claim nothing, as a dead worker does."""
 
 
 async def running(jobs: Jobs, job: JobInfo) -> None:
@@ -107,7 +107,7 @@ async def running(jobs: Jobs, job: JobInfo) -> None:
     await wait_until_async(lambda: held.info.state is JobState.RUNNING, "the job to run")
 
 
-def test_a_job_of_a_worker_that_died_is_done_by_another(fleet):
+def test_a_job_of_a_dead_worker_is_completed_by_another(fleet):
     async def work(start):
         first, second = await start("w0"), await start("w1")
         job = await first.start(SIMULATION, for_ever)
@@ -120,7 +120,7 @@ def test_a_job_of_a_worker_that_died_is_done_by_another(fleet):
     assert done.result == {"by": "w1", "asked": {"scenario": "sc_1"}}
 
 
-def test_of_several_workers_that_try_one_gets_a_job(url):
+def test_only_one_of_several_workers_claims_a_job(url):
     left = JobInfo(job_id="job_1", kind="export", subject="a", state="running", created_at="then")
 
     async def work():
@@ -141,7 +141,7 @@ def test_of_several_workers_that_try_one_gets_a_job(url):
     assert [claim.deaths for claim in claims if claim is not None] == [1]
 
 
-def test_a_job_that_cannot_be_made_again_is_marked_by_another(fleet):
+def test_a_job_that_cannot_be_repeated_is_marked_interrupted_by_another_worker(fleet):
     async def work(start):
         first, second = await start("w0"), await start("w1")
         job = await first.start(NewJob("drive", "tiny"), for_ever)
@@ -154,7 +154,7 @@ def test_a_job_that_cannot_be_made_again_is_marked_by_another(fleet):
     assert left.error.retryable
 
 
-def test_a_job_that_kills_workers_is_given_up_with_the_reason(fleet):
+def test_a_job_fails_after_too_many_worker_deaths(fleet):
     async def work(start):
         first, second = await start("w0"), await start("w1")
         job = await first.start(SIMULATION, for_ever)
@@ -169,7 +169,7 @@ def test_a_job_that_kills_workers_is_given_up_with_the_reason(fleet):
     assert f"{MAX_DEATHS} workers died" in left.error.detail
 
 
-def test_cancelling_reaches_the_worker_that_has_the_job(fleet):
+def test_cancelling_reaches_the_worker_that_runs_the_job(fleet):
     async def work(start):
         first, second = await start("w0"), await start("w1")
         job = await first.start(NewJob("export", "tiny"), for_ever)
@@ -181,7 +181,7 @@ def test_cancelling_reaches_the_worker_that_has_the_job(fleet):
     assert told.state is there.state is JobState.CANCELLED
 
 
-def test_any_worker_tells_how_far_a_job_is_until_it_is_over(fleet):
+def test_any_worker_streams_the_progress_of_a_job(fleet):
     async def work(start):
         first, second = await start("w0"), await start("w1")
         gate = asyncio.Event()
@@ -204,7 +204,7 @@ def test_any_worker_tells_how_far_a_job_is_until_it_is_over(fleet):
     assert [info.event for info in seen] == sorted({info.event for info in seen})
 
 
-def test_a_worker_with_room_takes_what_waits_with_another(fleet, monkeypatch):
+def test_an_idle_worker_claims_jobs_queued_at_another(fleet, monkeypatch):
     async def work(start):
         first, second = await start("w0"), await start("w1")
         busy = await first.start(NewJob("simulate", "tiny"), for_ever)
@@ -218,7 +218,7 @@ def test_a_worker_with_room_takes_what_waits_with_another(fleet, monkeypatch):
     assert (busy.worker, busy.state) == ("w0", JobState.RUNNING)
 
 
-def test_a_worker_that_slept_cannot_end_a_job_that_went_on_elsewhere(fleet):
+def test_a_worker_with_an_expired_lease_cannot_update_a_job_completed_elsewhere(fleet):
     async def work(start):
         first, second = await start("w0"), await start("w1")
         job = await first.start(SIMULATION, for_ever)
@@ -233,7 +233,7 @@ def test_a_worker_that_slept_cannot_end_a_job_that_went_on_elsewhere(fleet):
     assert fleet(work).result["by"] == "w1"
 
 
-def test_a_worker_that_stops_leaves_its_jobs_to_others(fleet, url, tmp_path):
+def test_a_stopped_worker_leaves_its_jobs_to_others(fleet, url, tmp_path):
     async def work(start):
         async with worker(url, "w0", tmp_path, alive=False) as first:
             job = await first.start(SIMULATION, for_ever)

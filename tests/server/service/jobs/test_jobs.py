@@ -23,7 +23,7 @@ VIDEO = {"scene": "tiny", "camera": "front", "width": 64}
 
 @pytest.fixture
 def with_jobs(tmp_path):
-    """Runs ``work(jobs)`` on jobs of their own, in a store that outlives them."""
+    """Run ``work(jobs)`` on a fresh ``Jobs`` instance. The store persists between calls."""
 
     def run(work):
         async def inside():
@@ -50,7 +50,7 @@ async def until_over(jobs: Jobs, job: JobInfo) -> JobInfo:
 
 
 async def until_states(jobs: Jobs, started: list[JobInfo], states: list[str]) -> None:
-    """Return once jobs are in these states."""
+    """Wait until the jobs have these states."""
 
     def now() -> list[str]:
         return [jobs._jobs[job.job_id].info.state.value for job in started]
@@ -82,7 +82,7 @@ def test_a_job_runs_and_keeps_its_result(with_jobs):
     assert again == done
 
 
-def test_a_failure_tells_its_problem(with_jobs):
+def test_a_failed_job_reports_its_problem(with_jobs):
     async def work(jobs):
         return await until_over(jobs, await jobs.start(NewJob("export", "tiny"), wrongly))
 
@@ -103,7 +103,7 @@ def test_cancelling_ends_running_and_waiting_jobs(with_jobs):
     assert [job.state for job in with_jobs(work)] == [JobState.CANCELLED] * 2
 
 
-def test_heavy_jobs_take_turns_and_light_ones_do_not_wait(with_jobs):
+def test_heavy_jobs_run_one_at_a_time_and_light_jobs_do_not_wait(with_jobs):
     async def work(jobs):
         await jobs.start(NewJob("simulate", "a"), for_ever)
         heavy = await jobs.start(NewJob("simulate", "b"), nothing)
@@ -115,7 +115,7 @@ def test_heavy_jobs_take_turns_and_light_ones_do_not_wait(with_jobs):
     assert (heavy.state, light.state) == (JobState.QUEUED, JobState.SUCCEEDED)
 
 
-def test_exports_do_not_wait_for_physics_and_two_run_at_a_time(with_jobs):
+def test_two_exports_run_at_a_time_independently_of_physics(with_jobs):
     async def work(jobs):
         physics = [await jobs.start(NewJob("simulate", "a"), for_ever) for _ in range(2)]
         exports = [await jobs.start(NewJob("export", "a"), for_ever) for _ in range(3)]
@@ -138,7 +138,7 @@ def test_a_stopped_worker_marks_its_jobs_interrupted(with_jobs):
         assert left.error.retryable
 
 
-def test_a_killed_worker_marks_its_jobs_at_the_next_start(with_jobs, tmp_path):
+def test_jobs_of_a_killed_worker_are_marked_interrupted_at_the_next_start(with_jobs, tmp_path):
     async def leave_one_running(jobs):
         stuck = JobInfo(
             job_id="job_1", kind="export", subject="a", state="running", created_at="then"
@@ -148,7 +148,7 @@ def test_a_killed_worker_marks_its_jobs_at_the_next_start(with_jobs, tmp_path):
     with_jobs(leave_one_running)
     left = with_jobs(lambda jobs: jobs.get("job_1"))
     assert left.state is JobState.INTERRUPTED
-    # Newer than any progress that somebody may have seen before.
+    # Higher than any event number seen before.
     assert left.event > 1000
 
 
@@ -167,7 +167,7 @@ def test_too_many_waiting_jobs_are_refused(with_jobs):
     assert error.headers["Retry-After"]
 
 
-def test_events_tell_every_change_in_order(with_jobs):
+def test_events_report_every_change_in_order(with_jobs):
     async def three_steps(context):
         for share in (0.2, 0.4, 0.6):
             context.progress(share, "stepping")
@@ -184,7 +184,7 @@ def test_events_tell_every_change_in_order(with_jobs):
     assert [e.state.value for e in events][::5] == ["queued", "succeeded"]
 
 
-def test_events_go_on_behind_the_last_one_seen(with_jobs):
+def test_events_continue_after_the_last_one_seen(with_jobs):
     async def work(jobs):
         job = await jobs.start(NewJob("export", "a"), nothing)
         await until_over(jobs, job)
@@ -196,7 +196,7 @@ def test_events_go_on_behind_the_last_one_seen(with_jobs):
 # --- over REST --------------------------------------------------------------------------------
 
 
-def test_a_video_of_a_scene_has_a_frame_for_every_instant(client, tmp_path):
+def test_a_video_of_a_scene_covers_the_whole_recording(client, tmp_path):
     job = succeeded(client, client.post("/v1/exports", json=VIDEO | {"fps": 5}))
     assert job["result"]["frames"] == 11
 
@@ -214,7 +214,7 @@ def test_a_video_of_a_scene_has_a_frame_for_every_instant(client, tmp_path):
     ]
 
 
-def test_a_video_of_a_scenario_plays_its_span(client):
+def test_a_video_of_a_scenario_covers_its_time_span(client):
     scenario = client.post("/v1/scenarios", json={"scene": "tiny"}).json()["scenario_id"]
     cut = {"operations": [{"op": "set_time", "start_us": 1_000_000, "end_us": 1_500_000}]}
     client.post(f"/v1/scenarios/{scenario}/operations", json=cut)
@@ -232,13 +232,13 @@ def test_a_video_of_a_scenario_plays_its_span(client):
         ({"scenario": "both"}, ErrorCode.INVALID_REQUEST),
     ],
 )
-def test_a_wrong_export_is_refused_at_once(client, change, code):
+def test_an_invalid_export_is_refused_immediately(client, change, code):
     answer = client.post("/v1/exports", json=VIDEO | change)
     assert answer.json()["code"] == code
     assert client.get("/v1/jobs").json()["jobs"] == []
 
 
-def test_an_export_under_a_key_runs_once(client):
+def test_an_export_with_an_idempotency_key_runs_once(client):
     first, again = (
         client.post("/v1/exports", json=VIDEO, headers={"Idempotency-Key": "k"}) for _ in range(2)
     )
@@ -247,7 +247,7 @@ def test_an_export_under_a_key_runs_once(client):
     finished(client, first)
 
 
-def test_events_over_rest_end_with_the_job(client):
+def test_the_event_stream_ends_with_the_job(client):
     job = client.post("/v1/exports", json=VIDEO, headers={"X-Real2Sim-Client": "anna"}).json()
     url = f"/v1/jobs/{job['job_id']}/events"
     with client.stream("GET", url) as stream:
@@ -278,7 +278,7 @@ def test_a_running_export_can_be_cancelled(client, held_videos):
     assert finished(client, job)["state"] == "cancelled"
 
 
-def test_files_of_a_job_that_is_not_done_are_refused(client, held_videos):
+def test_files_of_an_unfinished_job_are_refused(client, held_videos):
     job = client.post("/v1/exports", json=VIDEO).headers["Location"]
     assert client.get(f"{job}/files/video.webm").json()["code"] == ErrorCode.JOB_NOT_DONE
     client.delete(job)
@@ -286,7 +286,7 @@ def test_files_of_a_job_that_is_not_done_are_refused(client, held_videos):
     assert client.get(f"{job}/files/video.webm").json()["code"] == ErrorCode.JOB_FAILED
 
 
-def test_loading_a_scene_that_takes_long_goes_on_as_a_job(client):
+def test_a_slow_scene_load_continues_as_a_job(client):
     answer = client.put("/v1/scenes/tiny/residency", headers={"Prefer": "respond-async"})
     job = finished(client, answer)
     assert (job["kind"], job["subject"], job["state"]) == ("load_scene", "tiny", "succeeded")

@@ -1,4 +1,4 @@
-"""What a request to simulate asks for: the background as colliders, the ego as an object."""
+"""Rollout plans made from simulation requests."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ SHORT = {"end_us": 100_000, "frame_us": 100_000}
 
 
 @pytest.mark.parametrize(("given", "solid"), [(None, True), (True, True), (False, False)])
-def test_the_background_is_solid_unless_it_is_left_out(tiny_scene, given, solid):
+def test_the_background_is_solid_unless_excluded(tiny_scene, given, solid):
     request = SimulateRequest(**SHORT, objects=["car_red"], background=given)
     plan = plan_rollout(tiny_scene, ScenarioState.of(tiny_scene), request)
     assert plan.options.background is solid
 
 
-def test_the_ego_takes_part_and_is_seen_from_outside_alone(tiny_scene, tmp_path):
+def test_the_ego_is_simulated_and_visible_only_from_outside(tiny_scene, tmp_path):
     state = ScenarioState.of(tiny_scene)
     plan = plan_rollout(tiny_scene, state, SimulateRequest(**SHORT, objects=["ego"]))
     told, _ = run_rollout(plan, tmp_path, progress=lambda share: None, cancelled=lambda: False)
@@ -37,7 +37,7 @@ def test_the_ego_takes_part_and_is_seen_from_outside_alone(tiny_scene, tmp_path)
     assert np.ptp(ego.cloud.means.numpy(), axis=0)[0] == pytest.approx(4.6, abs=0.05)
 
 
-def test_who_is_not_there_is_named(tiny_scene):
+def test_an_unknown_object_is_named_in_the_error(tiny_scene):
     request = SimulateRequest(**SHORT, objects=["ego", "nobody"])
     with pytest.raises(ServiceError, match="nobody"):
         plan_rollout(tiny_scene, ScenarioState.of(tiny_scene), request)

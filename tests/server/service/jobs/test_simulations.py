@@ -23,7 +23,7 @@ def edit(client, url, *operations) -> None:
     assert answer.status_code == 200, answer.text
 
 
-def test_a_pushed_car_rolls_on_and_can_be_looked_at(client, scenario):
+def test_a_pushed_car_moves_and_its_rollout_can_be_rendered(client, scenario):
     edit(client, scenario, PUSH)
     job = finished(client, client.post(f"{scenario}/simulate", json=SHORT))
     assert job["state"] == "succeeded", job
@@ -49,7 +49,7 @@ def test_a_pushed_car_rolls_on_and_can_be_looked_at(client, scenario):
     assert video_source["result"]["frames"] == 4
 
 
-def test_physics_speed_and_wall_given_by_operations_are_what_the_rollout_has(client, scenario):
+def test_the_rollout_uses_the_mass_speed_and_collider_set_by_operations(client, scenario):
     wall = {"kind": "box", "position": [17.0, -3.0, 1.0], "size": [1.0, 4.0, 2.0]}
     edit(
         client,
@@ -62,7 +62,7 @@ def test_physics_speed_and_wall_given_by_operations_are_what_the_rollout_has(cli
     assert job["state"] == "succeeded", job
     hits = {(c["object_id"], c["other"]): c for c in job["result"]["contacts"]}
     hit = hits["car_red", "barrier"]
-    # Half a metre at 6 m/s; Gaussians of this car reach a little out of its box.
+    # Half a metre at 6 m/s. This car's Gaussians extend slightly beyond its box.
     assert 0.02 < hit["first_s"] < 0.1
     assert 5.0 < hit["delta_v"] < 9.0
     assert hit["impulse"][0] == pytest.approx(-950.0 * hit["delta_v"], rel=0.05)
@@ -74,9 +74,7 @@ def test_physics_speed_and_wall_given_by_operations_are_what_the_rollout_has(cli
     assert own["velocities"][-1][0] < 1.0
 
 
-def test_values_of_the_papers_table_can_be_asked_for_and_posts_of_any_shape_are_met(
-    client, scenario
-):
+def test_parameters_of_the_paper_and_a_cylinder_collider_are_applied(client, scenario):
     post = {"kind": "cylinder", "position": [16.7, -3.0, 1.0], "radius": 0.1, "height": 3.0}
     table = {"young": 2e6, "poisson": 0.4, "density": 200.0, "friction": 0.0, "grid": 30}
     edit(
@@ -107,14 +105,14 @@ def test_values_of_the_papers_table_can_be_asked_for_and_posts_of_any_shape_are_
         ({"speed": 3}, "INVALID_REQUEST", "speed is of an experiment"),
     ],
 )
-def test_values_that_fit_nothing_are_refused(client, scenario, asked, code, words):
+def test_invalid_values_are_refused(client, scenario, asked, code, words):
     answer = client.post(f"{scenario}/simulate", json=SHORT | asked)
     assert answer.status_code in {404, 422}
     assert answer.json()["code"] == code
     assert words in answer.text
 
 
-def test_a_mesh_that_is_open_is_refused_with_what_to_do(client, scenario):
+def test_an_open_mesh_is_refused_with_a_hint(client, scenario):
     mesh = {"kind": "mesh", "vertices": [[0, 0, 0], [1, 0, 0], [0, 1, 0]], "triangles": [[0, 1, 2]]}
     operations = [{"op": "add_collider", "shape": mesh}]
     answer = client.post(f"{scenario}/operations", json={"operations": operations})
@@ -123,7 +121,7 @@ def test_a_mesh_that_is_open_is_refused_with_what_to_do(client, scenario):
     assert "thickness" in answer.json()["hint"]
 
 
-def test_an_experiment_of_the_paper_is_a_job(client, scenario):
+def test_an_experiment_of_the_paper_runs_as_a_job(client, scenario):
     asked = {"experiment": "wall", "objects": ["car_red"], "speed": 5, "end_us": 150_000}
     job = finished(client, client.post(f"{scenario}/simulate", json=asked))
     assert job["state"] == "succeeded", job
@@ -131,7 +129,7 @@ def test_an_experiment_of_the_paper_is_a_job(client, scenario):
     assert ("car_red", "wall") in {(c["object_id"], c["other"]) for c in job["result"]["contacts"]}
 
 
-def test_a_rollout_that_begins_inside_a_collider_fails_with_the_reason(client, scenario):
+def test_a_rollout_that_starts_inside_a_collider_fails_with_the_reason(client, scenario):
     inside = {"kind": "box", "position": [14.0, -3.0, 1.0], "size": [1.0, 4.0, 2.0]}
     edit(client, scenario, PUSH, {"op": "add_collider", "collider_id": "in", "shape": inside})
     job = finished(client, client.post(f"{scenario}/simulate", json=SHORT))
@@ -166,9 +164,7 @@ def test_a_rollout_that_begins_inside_a_collider_fails_with_the_reason(client, s
         ),
     ],
 )
-def test_nonsense_for_the_physics_is_refused_by_the_name_of_the_field(
-    client, scenario, operation, field
-):
+def test_invalid_physics_are_refused_with_the_field_name(client, scenario, operation, field):
     answer = client.post(f"{scenario}/operations", json={"operations": [operation]})
     assert answer.status_code == 422
     problem = answer.json()
@@ -177,9 +173,7 @@ def test_nonsense_for_the_physics_is_refused_by_the_name_of_the_field(
     assert client.get(scenario).json()["revision"] == 0
 
 
-def test_what_only_the_rollout_finds_wrong_fails_with_the_reason_and_the_worker_goes_on(
-    client, scenario
-):
+def test_errors_found_during_the_rollout_fail_the_job_but_not_the_worker(client, scenario):
     start = client.post(f"{scenario}/simulate", json=SHORT | {"objects": ["car_red", "car_blue"]})
     assert finished(client, start)["state"] == "succeeded"
     onto_it = {
@@ -202,7 +196,7 @@ def test_what_only_the_rollout_finds_wrong_fails_with_the_reason_and_the_worker_
     assert finished(client, client.post(f"{scenario}/simulate", json=SHORT))["state"] == "succeeded"
 
 
-def test_without_anything_set_in_motion_nothing_is_simulated(client, scenario):
+def test_simulating_without_any_motion_is_refused(client, scenario):
     answer = client.post(f"{scenario}/simulate")
     assert answer.json()["code"] == ErrorCode.INVALID_REQUEST
     assert "set_velocity" in answer.json()["hint"]
@@ -216,12 +210,12 @@ def test_without_anything_set_in_motion_nothing_is_simulated(client, scenario):
         ({"preset": "magic"}, ErrorCode.INVALID_REQUEST),
     ],
 )
-def test_a_wrong_rollout_is_refused_at_once(client, scenario, change, code):
+def test_an_invalid_rollout_is_refused_immediately(client, scenario, change, code):
     answer = client.post(f"{scenario}/simulate", json=SHORT | change)
     assert answer.json()["code"] == code
 
 
-def test_a_job_of_another_kind_is_no_film(client):
+def test_a_job_of_another_kind_has_no_preview(client):
     video = {"scene": "tiny", "camera": "front", "width": 64, "end_us": 100_000}
     job = finished(client, client.post("/v1/exports", json=video))
     answer = client.get(f"/v1/jobs/{job['job_id']}/preview", params={"camera": "front"})

@@ -1,4 +1,4 @@
-"""Sweeps and searches as jobs of a worker."""
+"""Sweep and search jobs of a worker."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ CUT_IN = {
 
 @pytest.fixture(autouse=True)
 def _hardly_gives_way(monkeypatch):
-    """Beside other work, a sweep that gives way would take minutes."""
+    """A sweep that yields to other work would take minutes."""
     monkeypatch.setattr(drives, "NICENESS", 1)
 
 
@@ -43,7 +43,7 @@ def over(client, job: dict) -> dict:
 
 
 def wait_driving(client, job: dict) -> None:
-    """Return once a sweep drives its episodes."""
+    """Wait until a sweep drives its episodes."""
     path = f"/v1/jobs/{job['job_id']}"
     wait_until(lambda: "left" in client.get(path).json()["stage"], lambda: client.get(path).text)
 
@@ -60,7 +60,7 @@ def left(client, job: dict, name: str) -> bytes:
     return answer.content
 
 
-def test_a_callers_scenario_leaves_the_table_that_the_command_makes(client, scenes_dir, tmp_path):
+def test_a_sweep_of_an_uploaded_scenario_matches_the_command(client, scenes_dir, tmp_path):
     text = write_openscenario(corner_case("cut_in").storyboard()).decode()
     job = over(client, begun(client, corner_case=None, openscenario=text))
     assert job["state"] == "succeeded", job["error"]
@@ -76,7 +76,7 @@ def test_a_callers_scenario_leaves_the_table_that_the_command_makes(client, scen
     episodes = pq.read_table(io.BytesIO(table))
     assert job["result"]["episodes"] == episodes.num_rows == 6
     assert sorted(set(episodes["gap"].to_pylist())) == [6.0, 10.0, 14.0]
-    # The worst leave recordings and scenario files.
+    # The worst episodes have recordings and scenario files.
     assert len(job["result"]["worst"]) == 2
     for key in job["result"]["worst"]:
         recording_of_bytes(left(client, job, f"{key}.r2e"), key)
@@ -86,7 +86,7 @@ def test_a_callers_scenario_leaves_the_table_that_the_command_makes(client, scen
     assert len(names) == 5
 
 
-def test_what_lies_beside_an_uploaded_file_is_not_read(tmp_path, scenes_dir):
+def test_a_road_file_named_by_an_uploaded_scenario_is_not_read(tmp_path, scenes_dir):
     secret = tmp_path / "secret.xodr"
     secret.write_text("<OpenDRIVE/>")
     text = write_openscenario(corner_case("cut_in").storyboard()).decode()
@@ -99,7 +99,7 @@ def test_what_lies_beside_an_uploaded_file_is_not_read(tmp_path, scenes_dir):
     assert (read.board.roads.kind, read.road_file) == ("map", None)
 
 
-def test_a_search_leaves_its_failures_and_all_of_it_packed(client, tmp_path):
+def test_a_search_saves_its_failures_and_an_archive(client, tmp_path):
     pytest.importorskip("cmaes")
     ask = {"kind": "search", "episodes": 20, "shrink": 0}
     changes = {"method": ask, "planners": ["follow_route"]}
@@ -119,7 +119,7 @@ def test_a_sweep_can_be_cancelled(client):
     assert over(client, job)["state"] == "cancelled"
 
 
-def test_a_stopped_worker_goes_on_where_its_sweep_was(start_worker, run_worker, tmp_path):
+def test_a_sweep_resumes_after_a_worker_restart(start_worker, run_worker, tmp_path):
     with run_worker() as client:
         job = begun(client, method={"kind": "sobol", "count": 50})
         wait_driving(client, job)
@@ -142,14 +142,14 @@ REFUSED = (
 )
 
 
-def test_what_cannot_be_swept_is_refused_before_it_begins(client):
+def test_an_invalid_sweep_is_refused_before_it_starts(client):
     for changes, words in REFUSED:
         answer = client.post("/v1/sweeps", json=CUT_IN | changes)
         assert answer.status_code in {404, 422}, changes
         assert words in answer.text, changes
 
 
-def test_a_parameter_that_the_scenario_has_not_fails_the_job_with_a_sentence(client, tmp_path):
+def test_an_unknown_scenario_parameter_fails_the_job_with_a_message(client, tmp_path):
     job = over(client, begun(client, parameters={"gapp": GAP}))
     assert job["state"] == "failed"
     assert "no parameter 'gapp'" in job["error"]["detail"]

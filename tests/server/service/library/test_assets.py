@@ -41,19 +41,19 @@ def splat_file(request, tmp_path, tiny_scene):
     return path
 
 
-def test_an_object_is_cut_out_of_a_scene_with_its_light(client):
+def test_an_object_is_cut_out_of_a_scene_with_its_ambient_light(client):
     answer = client.post("/v1/assets", json=CUT)
     info = AssetInfo.model_validate(answer.json())
     assert answer.status_code == 201
     assert answer.headers["Location"] == "/v1/assets/red"
     assert (info.category, info.size, info.gaussians) == ("car", (4.0, 1.8, 1.5), 60)
-    # The street of the test is grey, 0.4 throughout.
+    # The test street is uniformly grey (0.4).
     assert info.ambient == pytest.approx((0.4, 0.4, 0.4), abs=0.01)
     assert client.get("/v1/assets").json()["assets"] == [answer.json()]
     assert client.get("/v1/assets/red").json() == answer.json()
 
 
-def test_assets_never_change(client):
+def test_an_existing_asset_cannot_be_overwritten(client):
     client.post("/v1/assets", json=CUT)
     again = client.post("/v1/assets", json=CUT | {"object_id": "post"})
     assert again.json()["code"] == ErrorCode.ALREADY_EXISTS
@@ -68,7 +68,7 @@ def test_assets_never_change(client):
         ({"colour": "red"}, ErrorCode.INVALID_REQUEST),
     ],
 )
-def test_a_wrong_cut_is_refused(client, change, code):
+def test_an_invalid_cut_is_refused(client, change, code):
     assert client.post("/v1/assets", json=CUT | change).json()["code"] == code
 
 
@@ -77,13 +77,13 @@ def test_a_body_nested_too_deeply_is_refused(client):
     assert (answer.status_code, answer.json()["code"]) == (422, "INVALID_REQUEST")
 
 
-def test_every_splat_format_can_be_uploaded_at_a_real_size(client, splat_file):
+def test_every_splat_format_can_be_uploaded_with_a_metric_length(client, splat_file):
     answer = upload(client, splat_file, category="truck", up_axis="z", length="8")
     info = AssetInfo.model_validate(answer.json())
     assert answer.status_code == 201, answer.text
     assert (info.asset_id, info.category) == ("thing", "truck")
     assert info.size[0] == pytest.approx(8.0)
-    # As wide and high against its length as the file's Gaussians are.
+    # Width and height keep the proportions of the file's Gaussians.
     assert info.size[1] / info.size[0] == pytest.approx(1.8 / 4.0, rel=0.1)
 
 
@@ -93,11 +93,11 @@ def test_an_exported_object_is_uploaded_upright(client, tiny_scene, tmp_path, na
     answer = upload(client, tmp_path / "out" / f"001_car_red.{name}", length="4")
     info = AssetInfo.model_validate(answer.json())
     assert info.provenance["up_axis"] == axis
-    # As long, wide and high as the car is.
+    # The size of the car.
     assert info.size == pytest.approx((4.0, 1.8, 1.5), rel=0.1)
 
 
-def test_a_file_that_is_no_splat_is_refused_without_a_trace(client, tmp_path):
+def test_a_file_that_is_not_a_splat_file_is_refused_and_leaves_no_asset(client, tmp_path):
     path = tmp_path / "thing.ply"
     path.write_bytes(b"ply\nnot really")
     answer = upload(client, path)
@@ -111,7 +111,7 @@ def test_an_upload_without_a_file_is_refused(client):
     assert answer.json()["code"] == ErrorCode.INVALID_REQUEST
 
 
-def test_a_thumbnail_shows_the_asset_on_a_light_floor(client):
+def test_a_thumbnail_shows_the_asset_on_a_light_background(client):
     client.post("/v1/assets", json=CUT)
     answer = client.get("/v1/assets/red/thumbnail", params={"width": 128})
     picture = cv2.imdecode(np.frombuffer(answer.content, np.uint8), cv2.IMREAD_COLOR)[:, :, ::-1]
@@ -122,7 +122,7 @@ def test_a_thumbnail_shows_the_asset_on_a_light_floor(client):
     assert picture[2, 2].min() > 200
 
 
-def test_an_inserted_asset_is_an_object_like_any_other(client):
+def test_an_inserted_asset_is_a_regular_object(client):
     client.post("/v1/assets", json=CUT)
     scenario = create(client)
     insert = {"op": "insert", "asset_id": "red", "pose": THERE}
@@ -130,13 +130,13 @@ def test_an_inserted_asset_is_an_object_like_any_other(client):
     assert result["created"] == ["red_1"]
     shown = objects(client, scenario)["red_1"]
     assert (shown["asset_id"], shown["recorded_id"], shown["gaussians"]) == ("red", None, 60)
-    # It stands on the ground although it was put five metres above it.
+    # Inserted five metres up, it is placed on the ground.
     assert shown["trajectory"]["positions"][0][2] == pytest.approx(0.75, abs=0.05)
     moved = edit(client, scenario, {"op": "translate", "object_id": "red_1", "x": -4.0})
     assert moved.status_code == 200
 
 
-def test_an_inserted_asset_is_seen_and_told_apart(client):
+def test_an_inserted_asset_is_rendered_with_its_instance_id(client):
     client.post("/v1/assets", json=CUT)
     scenario = create(client)
     edit(client, scenario, {"op": "insert", "asset_id": "red", "pose": {"position": [9, 0, 1]}})
@@ -162,14 +162,14 @@ def test_a_scenario_with_assets_survives_a_restart(run_worker):
         assert preview.status_code == 200
 
 
-def test_an_unknown_asset_is_refused_with_its_place(client):
+def test_an_unknown_asset_is_refused_with_a_pointer_to_the_operation(client):
     answer = edit(client, create(client), {"op": "insert", "asset_id": "bus", "pose": THERE})
     assert answer.status_code == 404
     assert answer.json()["code"] == ErrorCode.UNKNOWN_ASSET
     assert answer.json()["errors"][0]["pointer"] == "/operations/0"
 
 
-def test_an_asset_that_nobody_uses_can_be_deleted_and_its_id_given_again(client):
+def test_an_unused_asset_can_be_deleted_and_its_id_reused(client):
     assert client.post("/v1/assets", json=CUT).status_code == 201
     assert client.delete("/v1/assets/red").status_code == 204
     assert client.get("/v1/assets").json()["assets"] == []
@@ -177,7 +177,7 @@ def test_an_asset_that_nobody_uses_can_be_deleted_and_its_id_given_again(client)
     assert client.post("/v1/assets", json=CUT).status_code == 201
 
 
-def test_an_asset_in_a_history_stays_until_the_scenario_is_gone(client):
+def test_an_asset_in_a_history_cannot_be_deleted_before_the_scenario(client):
     client.post("/v1/assets", json=CUT)
     scenario = create(client)
     edit(client, scenario, {"op": "insert", "asset_id": "red", "pose": THERE})
@@ -190,7 +190,7 @@ def test_an_asset_in_a_history_stays_until_the_scenario_is_gone(client):
     assert client.delete("/v1/assets/red").status_code == 204
 
 
-def test_an_asset_whose_id_is_part_of_a_used_one_can_be_deleted(client):
+def test_an_asset_whose_id_resembles_a_used_id_can_be_deleted(client):
     for name in ("red", "red_2", "redx2"):
         client.post("/v1/assets", json=CUT | {"asset_id": name})
     edit(client, create(client), {"op": "insert", "asset_id": "redx2", "pose": THERE})
@@ -202,7 +202,7 @@ PERSON = {"asset_id": "anna", "build": "woman", "height": 1.7, "clothes": {"top"
 
 
 def track(speed: float, height: float = 0.8) -> dict:
-    """Across the street ahead of the ego, to the left."""
+    """A track across the street, ahead of the ego and to the left."""
     times = [0, 500_000, 1_000_000]
     half = 2**-0.5
     return {
@@ -219,7 +219,7 @@ def picture(client, scenario, t_us: int) -> np.ndarray:
     return cv2.imdecode(np.frombuffer(answer.content, np.uint8), cv2.IMREAD_COLOR)
 
 
-def test_a_person_is_made_and_walks_where_a_trajectory_leads(client):
+def test_a_generated_person_walks_along_a_trajectory(client):
     answer = client.post("/v1/assets", json=PERSON)
     info = AssetInfo.model_validate(answer.json())
     assert answer.status_code == 201, answer.text
@@ -234,7 +234,7 @@ def test_a_person_is_made_and_walks_where_a_trajectory_leads(client):
     shown = picture(client, scenario, 500_000)
     seen = np.abs(shown.astype(int) - before).max(axis=2) > 20
     assert seen.sum() > 30
-    # At another speed through the same place the legs are elsewhere.
+    # At another speed through the same place, the leg pose differs.
     (name,) = inserted.json()["created"]
     there = track(1.4)
     slower = there | {"positions": [[7.0, -1.15 + 0.7 * t * 1e-6, 0.8] for t in there["times_us"]]}
@@ -248,6 +248,6 @@ def test_a_person_is_made_and_walks_where_a_trajectory_leads(client):
 @pytest.mark.parametrize(
     "change", [{"build": "giraffe"}, {"height": 3.0}, {"clothes": {"hat": [0, 0, 0]}}]
 )
-def test_a_wrong_person_is_refused(client, change):
+def test_an_invalid_person_is_refused(client, change):
     answer = client.post("/v1/assets", json=PERSON | change)
     assert answer.json()["code"] == ErrorCode.INVALID_REQUEST

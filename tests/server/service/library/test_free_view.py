@@ -1,4 +1,4 @@
-"""Pictures of a scene from cameras anywhere, with objects where the request has them."""
+"""Images of a scene from arbitrary cameras, with objects posed by the request."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ UPRIGHT = [1.0, 0.0, 0.0, 0.0]
 
 
 def camera(scene, name="front", *, t_us=0, **fields):
-    """A camera of the rig, where the vehicle was."""
+    """A camera of the rig at the recorded vehicle pose."""
     of_rig = scene.rig[name]
     pose = of_rig.pose(scene.ego.transform(t_us))
     quaternion = matrix_to_quaternion(pose[:3, :3]).tolist()
@@ -33,14 +33,14 @@ def image(frame):
 
 
 def ids(client, scene, **body):
-    """Instance ids that the front camera sees, and its image of them."""
+    """Instance ids visible to the front camera, and its instance image."""
     body = {"cameras": [camera(scene, modalities=["instance"])]} | body
     (frame,) = decode(client.post(VIEW, json=body, headers=MSGPACK).content)["frames"]
     seen = image(frame)
     return {int(i) for i in np.unique(seen)} - {0}, seen
 
 
-def test_from_the_recorded_place_it_is_the_recorded_picture(client, tiny_scene):
+def test_a_view_from_the_recorded_pose_equals_the_recorded_frame(client, tiny_scene):
     body = {"t_us": 1_000_000, "cameras": [camera(tiny_scene, t_us=1_000_000)]}
     view = decode(client.post(VIEW, json=body, headers=MSGPACK).content)
     there = client.get(f"{VIEW}?camera=front&t_us=1000000", headers=MSGPACK)
@@ -48,7 +48,7 @@ def test_from_the_recorded_place_it_is_the_recorded_picture(client, tiny_scene):
     assert np.array_equal(image(view["frames"][0]), image(decode(there.content)))
 
 
-def test_an_object_is_drawn_where_the_request_has_it(client, tiny_scene):
+def test_an_object_is_rendered_at_its_requested_pose(client, tiny_scene):
     pose = {"position": [12.0, 1.5, 0.75], "quaternion": UPRIGHT}
     posed = [{"object_id": "car_red", "pose": pose}]
     _, seen = ids(client, tiny_scene, objects=posed, others="none")
@@ -66,19 +66,21 @@ def test_an_object_is_drawn_where_the_request_has_it(client, tiny_scene):
         ("none", set()),
     ],
 )
-def test_what_becomes_of_objects_that_are_not_posed_is_said(client, tiny_scene, others, shown):
+def test_the_others_option_decides_whether_unposed_objects_are_rendered(
+    client, tiny_scene, others, shown
+):
     seen, _ = ids(client, tiny_scene, others=others)
     assert seen == {tiny_scene.instance_id(object_id) for object_id in shown}
 
 
-def test_a_view_leaves_no_trace(client, tiny_scene):
+def test_a_view_does_not_change_the_scene(client, tiny_scene):
     before, _ = ids(client, tiny_scene)
     pose = {"position": [12.0, 1.5, 0.75], "quaternion": UPRIGHT}
     ids(client, tiny_scene, objects=[{"object_id": "car_red", "pose": pose}], others="none")
     assert ids(client, tiny_scene)[0] == before
 
 
-def test_several_cameras_come_in_one_answer_each_in_its_codec(client, tiny_scene):
+def test_one_response_holds_several_cameras_with_their_own_codecs(client, tiny_scene):
     body = {
         "cameras": [
             camera(tiny_scene, codec="jpeg"),
@@ -95,7 +97,7 @@ def test_several_cameras_come_in_one_answer_each_in_its_codec(client, tiny_scene
     assert frames[1]["shape"] == [40, 120, 3]
 
 
-def test_one_image_is_a_file_unless_asked_otherwise(client, tiny_scene):
+def test_a_single_image_is_returned_as_a_jpeg_file_by_default(client, tiny_scene):
     response = client.post(VIEW, json={"cameras": [camera(tiny_scene)]})
     assert response.headers["Content-Type"] == "image/jpeg"
 
@@ -108,7 +110,7 @@ def test_one_image_is_a_file_unless_asked_otherwise(client, tiny_scene):
         ({"cameras": []}, "INVALID_REQUEST"),
     ],
 )
-def test_what_cannot_be_drawn_is_refused(client, tiny_scene, body, code):
+def test_a_view_that_cannot_be_rendered_is_refused(client, tiny_scene, body, code):
     problem = client.post(VIEW, json={"cameras": [camera(tiny_scene)]} | body).json()
     assert problem["code"] == ErrorCode[code]
 
@@ -125,7 +127,7 @@ def test_what_cannot_be_drawn_is_refused(client, tiny_scene, body, code):
         {"pose": {"position": [0, 0, 0], "quaternion": [1, 1, 0, 0]}},
     ],
 )
-def test_what_is_no_camera_is_refused(client, tiny_scene, wrong):
+def test_an_invalid_camera_is_refused(client, tiny_scene, wrong):
     response = client.post(VIEW, json={"cameras": [camera(tiny_scene, **wrong)]})
     assert response.status_code == 422
 
@@ -139,7 +141,7 @@ def test_what_is_no_camera_is_refused(client, tiny_scene, wrong):
         {"t_us": -(2**62), "objects": {"position": [1e6, 1e6, -1e6], "quaternion": UPRIGHT}},
     ],
 )
-def test_what_is_allowed_at_its_extremes_is_drawn(client, tiny_scene, extreme):
+def test_extreme_valid_values_are_rendered(client, tiny_scene, extreme):
     wanted = camera(tiny_scene, **extreme.pop("cameras", {}))
     pose = extreme.pop("objects", None)
     objects = [{"object_id": "car_blue", "pose": pose}] if pose else []
@@ -148,7 +150,7 @@ def test_what_is_allowed_at_its_extremes_is_drawn(client, tiny_scene, extreme):
     assert response.status_code == 200, response.text
 
 
-def test_a_name_given_twice_is_refused(client, tiny_scene):
+def test_duplicate_camera_names_are_refused(client, tiny_scene):
     twice = client.post(VIEW, json={"cameras": [camera(tiny_scene)] * 2})
     assert "cameras name one twice" in twice.text
 

@@ -1,4 +1,4 @@
-"""What an import may cost: memory by what comes out, time, disk, and nobody else's turn."""
+"""Limits of imports: decoded size, memory, time, disk quota and queue length."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MIB = 1024**2
 
 
 def many_splats(path: Path, count: int) -> Path:
-    """An spz file of ``count`` equal splats of degree 3, a few bytes each thousand."""
+    """An spz file of ``count`` equal splats of degree 3, a few bytes per thousand splats."""
     header = Header(3, count, 3, 12, 0)
     arrays = {name: np.zeros(n, np.uint8) for name, n in header.stream_sizes.items()}
     path.write_bytes(write_streams(header, Streams(**arrays)))
@@ -39,7 +39,9 @@ def upload(client, where: str, file: Path, **fields):
 
 
 @pytest.mark.parametrize(("where", "named"), [("scenes", "scene"), ("assets", "asset_id")])
-def test_a_small_file_that_becomes_large_is_refused(start_worker, tmp_path, where, named):
+def test_a_small_file_that_decodes_to_a_large_scene_is_refused(
+    start_worker, tmp_path, where, named
+):
     client = start_worker(max_scene_bytes=MIB, max_asset_bytes=MIB)
     file = many_splats(tmp_path / "bomb.spz", 20_000)
     assert file.stat().st_size < 10_000
@@ -50,7 +52,7 @@ def test_a_small_file_that_becomes_large_is_refused(start_worker, tmp_path, wher
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".spz", ".splat"])
-def test_every_format_is_compared_with_the_limit(tmp_path, tiny_scene, suffix):
+def test_the_size_limit_applies_to_every_format(tmp_path, tiny_scene, suffix):
     file = tmp_path / f"a{suffix}"
     write_splats(tiny_scene.objects["car_red"].cloud, file)
     whole = import_splats(file, name="a").background.nbytes
@@ -59,27 +61,27 @@ def test_every_format_is_compared_with_the_limit(tmp_path, tiny_scene, suffix):
         import_splats(file, name="a", max_bytes=whole - 1)
 
 
-def test_reading_takes_no_more_than_a_few_times_what_comes_out(tmp_path):
+def test_peak_memory_of_an_import_is_a_small_multiple_of_the_scene_size(tmp_path):
     tight = StagingLimits(max_bytes=100 * MIB, memory_bytes=400 * MIB, seconds=600)
     file = many_splats(tmp_path / "many.spz", 400_000)
-    # All at the origin: the whole way is gone, and the memory was enough.
+    # All splats are at the origin. The import passes every stage within the memory limit.
     stage_scene(file, tmp_path / "many.r2s", name="many", limits=tight)
 
 
-def test_what_needs_more_memory_than_allowed_is_refused(tmp_path):
+def test_an_import_over_the_memory_limit_is_refused(tmp_path):
     file = many_splats(tmp_path / "many.spz", 400_000)
     tight = StagingLimits(max_bytes=100 * MIB, memory_bytes=60 * MIB, seconds=600)
     with pytest.raises(BundleTooLargeError, match=r"needs more than 60 MiB of memory"):
         stage_scene(file, tmp_path / "many.r2s", name="many", limits=tight)
 
 
-def test_what_takes_too_long_is_refused(tmp_path, thing):
+def test_an_import_over_the_time_limit_is_refused(tmp_path, thing):
     hasty = StagingLimits(max_bytes=100 * MIB, memory_bytes=1024 * MIB, seconds=0.001)
     with pytest.raises(BundleError, match="time limit"):
         stage_scene(thing, tmp_path / "a.r2s", name="a", limits=hasty)
 
 
-def test_scenes_load_while_an_import_is_read(client, thing, monkeypatch):
+def test_scenes_load_while_an_import_is_running(client, thing, monkeypatch):
     reading, done = threading.Event(), threading.Event()
     staged = imports.stage_scene
 
@@ -104,7 +106,7 @@ def test_scenes_load_while_an_import_is_read(client, thing, monkeypatch):
     assert answers[0].status_code == 201
 
 
-def test_more_imports_than_may_wait_are_refused_before_they_are_received(client, thing):
+def test_an_upload_over_the_import_queue_limit_is_refused(client, thing):
     worker = client.app.state.worker
     places = [worker.imports.place() for _ in range(MAX_IMPORTS)]
     for place in places:
@@ -147,6 +149,6 @@ def test_jobs_have_a_quota(start_worker, limit):
     assert (problem["status"], problem["code"]) == (507, ErrorCode.QUOTA_EXCEEDED)
 
 
-def test_loading_a_scene_needs_no_quota_of_jobs(start_worker):
+def test_loading_a_scene_does_not_count_against_the_jobs_quota(start_worker):
     client = start_worker(jobs_quota=0)
     assert client.put("/v1/scenes/tiny/residency").status_code in (200, 202)

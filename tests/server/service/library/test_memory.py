@@ -1,4 +1,4 @@
-"""One budget of memory for scenes and assets."""
+"""The memory budget shared by scenes and assets."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def one_asset(folder) -> int:
     return AssetLibrary(folder).get("a").nbytes
 
 
-def test_assets_that_were_used_last_stay(folder, one_asset):
+def test_the_least_recently_used_asset_is_evicted(folder, one_asset):
     budget = MemoryBudget(2 * one_asset)
     library = AssetLibrary(folder, budget)
     for name in ("a", "b", "a", "c"):
@@ -41,7 +41,7 @@ def test_assets_that_were_used_last_stay(folder, one_asset):
     assert sorted(library._alive) == ["a", "c"]
 
 
-def test_an_asset_that_is_shown_counts_and_is_the_same_when_asked_for_again(folder, one_asset):
+def test_an_asset_in_use_stays_in_memory_and_is_returned_again(folder, one_asset):
     library = AssetLibrary(folder, MemoryBudget(2 * one_asset))
     shown = library.find("a")
     for name in ("b", "c", "b"):
@@ -50,7 +50,7 @@ def test_an_asset_that_is_shown_counts_and_is_the_same_when_asked_for_again(fold
     assert library.find("a") is shown
 
 
-def test_when_all_assets_are_shown_another_is_refused_with_the_bytes(folder, one_asset):
+def test_an_asset_over_the_budget_is_refused_with_its_size(folder, one_asset):
     library = AssetLibrary(folder, MemoryBudget(2 * one_asset))
     shown = [library.find("a"), library.find("b")]
     with pytest.raises(ServiceError, match="asset 'c' needs") as caught:
@@ -61,22 +61,20 @@ def test_when_all_assets_are_shown_another_is_refused_with_the_bytes(folder, one
     assert library.find("c") is not None
 
 
-def test_an_asset_in_the_light_of_a_scene_counts_twice_where_it_has_other_colours(
-    folder, one_asset, tiny_scene
-):
+def test_relit_asset_colours_count_against_the_budget(folder, one_asset, tiny_scene):
     library = AssetLibrary(folder, MemoryBudget(10 * one_asset))
     asset = library.get("a")
     lit = asset.cloud_in(tiny_scene)
     assert library.held_bytes == one_asset + lit.sh.nbytes
 
 
-def test_the_list_of_assets_loads_none(folder):
+def test_listing_assets_loads_none(folder):
     library = AssetLibrary(folder, MemoryBudget(1))
     assert [info.asset_id for info in library.list()] == ["a", "b", "c"]
     assert library.held_bytes == 0
 
 
-def test_scenes_and_assets_make_room_for_each_other(tiny_scene, tmp_path):
+def test_scenes_and_assets_evict_each_other(tiny_scene, tmp_path):
     scenes, assets = tmp_path / "scenes", tmp_path / "assets"
     save_scene(replace(tiny_scene, name="street"), scenes / "street.r2s")
     needed = read_scene_summary(scenes / "street.r2s").nbytes

@@ -31,7 +31,7 @@ def one_scene(folder) -> int:
 
 
 def run(folder, work, *, budget_bytes: int = 10**9):
-    """Run ``work(scene_cache)`` with an engine of its own."""
+    """Run ``work(scene_cache)`` with a separate engine."""
 
     @asynccontextmanager
     async def running():
@@ -55,7 +55,7 @@ def resident(scene_cache) -> list[str]:
     return [name for name in NAMES if scene_cache.state(name) is SceneState.RESIDENT]
 
 
-def test_a_scene_is_loaded_when_it_is_first_needed(folder):
+def test_a_scene_is_loaded_on_first_use(folder):
     async def work(scene_cache):
         await scene_cache.refresh()
         before = scene_cache.state("a")
@@ -65,7 +65,7 @@ def test_a_scene_is_loaded_when_it_is_first_needed(folder):
     assert run(folder, work) == (SceneState.AVAILABLE, SceneState.RESIDENT, 3)
 
 
-def test_all_users_share_one_scene_object_and_one_load(folder, monkeypatch):
+def test_all_users_share_one_scene_object_loaded_once(folder, monkeypatch):
     loads = []
     load = scene_cache_module.load_scene
     monkeypatch.setattr(
@@ -80,7 +80,7 @@ def test_all_users_share_one_scene_object_and_one_load(folder, monkeypatch):
     assert len(loads) == 1
 
 
-def test_a_scene_is_loading_while_it_is_read(folder):
+def test_the_state_is_loading_while_a_scene_is_read(folder):
     async def work(scene_cache):
         task = asyncio.create_task(scene_cache.get("a"))
         states = set()
@@ -92,7 +92,7 @@ def test_a_scene_is_loading_while_it_is_read(folder):
     assert SceneState.LOADING in run(folder, work)
 
 
-def test_one_who_stops_waiting_does_not_end_the_load_for_the_others(folder):
+def test_cancelling_one_waiter_does_not_cancel_the_load(folder):
     async def work(scene_cache):
         first = asyncio.create_task(scene_cache.get("a"))
         second = asyncio.create_task(scene_cache.get("a"))
@@ -104,7 +104,7 @@ def test_one_who_stops_waiting_does_not_end_the_load_for_the_others(folder):
     assert run(folder, work).name == "a"
 
 
-def test_the_longest_unused_scene_leaves_first(folder, one_scene):
+def test_the_least_recently_used_scene_is_evicted(folder, one_scene):
     async def work(scene_cache):
         for name in ("a", "b", "a", "c"):
             await scene_cache.get(name)
@@ -113,7 +113,7 @@ def test_the_longest_unused_scene_leaves_first(folder, one_scene):
     assert run(folder, work, budget_bytes=2 * one_scene) == ["a", "c"]
 
 
-def test_a_pinned_scene_never_leaves(folder, one_scene):
+def test_a_pinned_scene_is_never_evicted(folder, one_scene):
     async def work(scene_cache):
         await scene_cache.pin("a")
         for name in ("b", "c"):
@@ -123,7 +123,7 @@ def test_a_pinned_scene_never_leaves(folder, one_scene):
     assert run(folder, work, budget_bytes=2 * one_scene) == ["a", "c"]
 
 
-def test_when_all_is_pinned_another_scene_is_refused_with_the_bytes(folder, one_scene):
+def test_a_scene_is_refused_with_its_size_if_all_others_are_pinned(folder, one_scene):
     async def work(scene_cache):
         await scene_cache.pin("a")
         with pytest.raises(ServiceError) as caught:
@@ -136,7 +136,7 @@ def test_when_all_is_pinned_another_scene_is_refused_with_the_bytes(folder, one_
     assert left == ["a"]
 
 
-def test_unpinned_again_it_makes_room(folder, one_scene):
+def test_an_unpinned_scene_can_be_evicted(folder, one_scene):
     async def work(scene_cache):
         async with scene_cache.pinned("a"):
             pass
@@ -146,7 +146,7 @@ def test_unpinned_again_it_makes_room(folder, one_scene):
     assert run(folder, work, budget_bytes=one_scene + 10) == ["b"]
 
 
-def test_a_scene_above_the_budget_is_refused_and_nothing_leaves(folder, one_scene, tiny_scene):
+def test_a_scene_over_the_budget_is_refused_and_evicts_nothing(folder, one_scene, tiny_scene):
     big = replace(tiny_scene, name="big", background=tiny_scene.background.with_sh_degree(3))
     save_scene(big, folder / "big.r2s")
 
@@ -159,7 +159,7 @@ def test_a_scene_above_the_budget_is_refused_and_nothing_leaves(folder, one_scen
     assert run(folder, work, budget_bytes=one_scene + 10) == (ErrorCode.OUT_OF_MEMORY, ["a"])
 
 
-def test_loads_under_way_count_against_the_budget(folder, one_scene, monkeypatch):
+def test_loads_in_progress_count_against_the_budget(folder, one_scene, monkeypatch):
     go_on, load = threading.Event(), scene_cache_module.load_scene
     monkeypatch.setattr(
         scene_cache_module, "load_scene", lambda path: go_on.wait(60) and load(path)
@@ -187,7 +187,7 @@ def test_a_scene_in_use_is_not_unloaded(folder):
     assert run(folder, work) == (ErrorCode.SCENE_IN_USE, SceneState.AVAILABLE)
 
 
-def test_an_unknown_scene_is_refused_with_the_names_there_are(folder):
+def test_an_unknown_scene_is_refused_with_the_available_names(folder):
     async def work(scene_cache):
         await scene_cache.get("zzz")
 
@@ -196,7 +196,7 @@ def test_an_unknown_scene_is_refused_with_the_names_there_are(folder):
     assert caught.value.code is ErrorCode.UNKNOWN_SCENE
 
 
-def test_a_bundle_changed_byte_is_found_while_loading_and_the_others_work(folder):
+def test_a_corrupt_bundle_is_detected_on_load_and_others_still_load(folder):
     tensors = folder / "a.r2s" / "background.safetensors"
     content = bytearray(tensors.read_bytes())
     content[-5] ^= 0xFF

@@ -30,33 +30,33 @@ def test_a_missing_folder_holds_no_scenes(tmp_path):
     assert SceneCatalog(tmp_path / "nowhere").scan() == {}
 
 
-def test_hidden_folders_and_other_files_are_passed_over(catalog, scenes_dir):
+def test_hidden_folders_and_other_files_are_ignored(catalog, scenes_dir):
     (scenes_dir / ".half.r2s").mkdir()
     (scenes_dir / "notes.txt").write_text("hello")
     (scenes_dir / "pictures").mkdir()
     assert set(catalog.scan()) == {"tiny"}
 
 
-def test_a_bundle_without_document_is_broken_and_the_others_are_not(catalog, scenes_dir):
+def test_only_a_bundle_without_a_document_is_broken(catalog, scenes_dir):
     (scenes_dir / "empty.r2s").mkdir()
     listings = catalog.scan()
     assert "no scene.json" in listings["empty"].reason
     assert listings["tiny"].reason is None
 
 
-def test_a_newer_bundle_is_broken_and_says_which_versions(catalog, scenes_dir):
+def test_a_bundle_of_a_newer_version_is_broken(catalog, scenes_dir):
     shutil.copytree(scenes_dir / "tiny.r2s", scenes_dir / "newer.r2s")
     edit_document(scenes_dir / "newer.r2s", version=99)
     assert "version 99" in catalog.scan()["newer"].reason
 
 
-def test_a_truncated_tensor_file_is_noticed_without_loading(catalog, scenes_dir):
+def test_a_truncated_tensor_file_is_detected_without_loading(catalog, scenes_dir):
     tensors = scenes_dir / "tiny.r2s" / "background.safetensors"
     tensors.write_bytes(tensors.read_bytes()[:-100])
     assert "cut short" in catalog.scan()["tiny"].reason
 
 
-def test_a_mended_bundle_is_noticed(catalog, scenes_dir):
+def test_a_repaired_bundle_is_no_longer_broken(catalog, scenes_dir):
     document = scenes_dir / "tiny.r2s" / "scene.json"
     whole = document.read_bytes()
     document.write_bytes(whole[:-50])
@@ -75,7 +75,7 @@ def test_an_unchanged_bundle_is_not_read_again(catalog):
     assert catalog.scan()["tiny"] is catalog.scan()["tiny"]
 
 
-def test_what_loading_found_is_remembered_until_the_bundle_changes(catalog, scenes_dir):
+def test_a_load_error_is_kept_until_the_bundle_changes(catalog, scenes_dir):
     catalog.mark_broken(catalog.scan()["tiny"], "hash differs")
     assert catalog.scan()["tiny"].reason == "hash differs"
     document = scenes_dir / "tiny.r2s" / "scene.json"
@@ -83,18 +83,18 @@ def test_what_loading_found_is_remembered_until_the_bundle_changes(catalog, scen
     assert catalog.scan()["tiny"].reason is None
 
 
-def test_two_folders_of_one_name_are_told_apart(catalog, scenes_dir):
+def test_two_bundles_with_the_same_scene_name_conflict(catalog, scenes_dir):
     shutil.copytree(scenes_dir / "tiny.r2s", scenes_dir / "tiny")
     listings = catalog.scan()
     assert sum(listing.reason is None for listing in listings.values()) == 1
     assert any("same scene name" in (listing.reason or "") for listing in listings.values())
 
 
-def test_a_folder_that_cannot_be_a_name_is_broken(catalog, scenes_dir):
+def test_a_folder_with_an_invalid_scene_name_is_broken(catalog, scenes_dir):
     shutil.copytree(scenes_dir / "tiny.r2s", scenes_dir / "my street.r2s")
     assert "cannot be a scene name" in catalog.scan()["my street"].reason
 
 
-def test_reasons_do_not_tell_where_the_folder_is(catalog, scenes_dir):
+def test_reasons_do_not_reveal_the_folder_path(catalog, scenes_dir):
     (scenes_dir / "empty.r2s").mkdir()
     assert str(scenes_dir) not in catalog.scan()["empty"].reason

@@ -26,7 +26,7 @@ def test_all_scenes_are_listed_with_cameras_and_objects_but_no_tracks(client):
     assert all(o.trajectory is None for o in scene.objects)
 
 
-def test_one_scene_comes_with_tracks_extent_and_ego(client, scenes_dir):
+def test_a_single_scene_includes_tracks_extent_and_ego(client, scenes_dir):
     scene = SceneInfo.model_validate(client.get("/v1/scenes/tiny").json())
     summary = read_scene_summary(scenes_dir / "tiny.r2s")
     blue = scene.objects[1]
@@ -45,7 +45,7 @@ def test_a_scene_can_be_loaded_and_unloaded(client):
     assert client.delete("/v1/scenes/tiny/residency").status_code == 200
 
 
-def test_a_scene_above_the_budget_is_refused_with_its_bytes(start_worker):
+def test_a_scene_over_the_budget_is_refused_with_its_size(start_worker):
     client = start_worker(scene_memory_bytes=1000)
     problem = client.put("/v1/scenes/tiny/residency").json()
     assert problem["code"] == ErrorCode.OUT_OF_MEMORY
@@ -71,11 +71,11 @@ def test_unknown_scenes_are_refused(client):
 
 
 @pytest.mark.parametrize("name", ["..", "%2e%2e", "a%2Fb", "-x", "a" * 81])
-def test_what_is_no_name_does_not_reach_the_disk(client, name):
+def test_an_invalid_name_is_refused(client, name):
     assert client.get(f"/v1/scenes/{name}").status_code in (404, 422)
 
 
-def test_broken_bundles_are_listed_with_the_reason_and_the_others_work(client, scenes_dir):
+def test_broken_bundles_are_listed_with_a_reason_and_do_not_affect_others(client, scenes_dir):
     newer, truncated = scenes_dir / "newer.r2s", scenes_dir / "truncated.r2s"
     for bundle in (newer, truncated):
         shutil.copytree(scenes_dir / "tiny.r2s", bundle)
@@ -105,13 +105,13 @@ def test_a_frame_is_a_jpeg_of_the_recorded_size(client):
     }
 
 
-def test_without_a_camera_the_first_one_is_drawn(client, tiny_scene):
+def test_the_first_camera_is_the_default(client, tiny_scene):
     camera = tiny_scene.rig.names[0]
     frame = client.get(f"/v1/scenes/tiny/render?camera={camera}")
     assert client.get("/v1/scenes/tiny/render").content == frame.content
 
 
-def test_png_and_msgpack_hold_the_same_pixels(client):
+def test_png_and_msgpack_contain_the_same_pixels(client):
     as_png = client.get(f"{RENDER}?camera=front", headers={"Accept": "image/png"})
     as_msgpack = client.get(f"{RENDER}?camera=front", headers={"Accept": "application/msgpack"})
     frame = decode(as_msgpack.content)
@@ -119,7 +119,7 @@ def test_png_and_msgpack_hold_the_same_pixels(client):
     assert np.array_equal(np.asarray(Image.open(io.BytesIO(as_png.content))), raw)
 
 
-def test_a_frame_shows_what_was_recorded_from_where_the_vehicle_was(client, tiny_scene):
+def test_a_frame_shows_the_recorded_objects_from_the_recorded_pose(client, tiny_scene):
     camera = tiny_scene.rig["front"]
     for t_us in (0, 1_050_000):
         url = f"{RENDER}?camera=front&modality=instance&t_us={t_us}"
@@ -142,7 +142,7 @@ def test_depth_is_metres_along_the_camera_axis(client):
     assert 4.5 < depth[36, 48] < 8.5
 
 
-def test_the_width_can_be_chosen_and_the_height_follows(client):
+def test_the_height_follows_the_requested_width(client):
     response = client.get(f"{RENDER}?camera=front&width=48")
     assert simplejpeg.decode_jpeg(response.content).shape == (32, 48, 3)
 
@@ -162,11 +162,11 @@ def test_the_same_request_gives_the_same_bytes(client):
         ("camera=front&width=9000", ErrorCode.INVALID_REQUEST),
     ],
 )
-def test_a_frame_that_cannot_be_is_refused(client, query, code):
+def test_an_invalid_frame_request_is_refused(client, query, code):
     assert client.get(f"{RENDER}?{query}").json()["code"] == code
 
 
-def test_a_frame_above_the_pixel_limit_is_refused(start_worker):
+def test_a_frame_over_the_pixel_limit_is_refused(start_worker):
     problem = start_worker(max_pixels_per_step=1000).get(f"{RENDER}?camera=front").json()
     assert problem["code"] == ErrorCode.INVALID_REQUEST
     assert "6144 pixels" in problem["detail"]
@@ -184,7 +184,7 @@ def test_a_frame_above_the_pixel_limit_is_refused(start_worker):
         ("text/html, */*;q=0.8", "rgb", "image/jpeg"),
     ],
 )
-def test_accept_picks_the_form(client, accept, modality, expected):
+def test_the_accept_header_selects_the_format(client, accept, modality, expected):
     url = f"{RENDER}?camera=front&modality={modality}"
     assert client.get(url, headers={"Accept": accept}).headers["Content-Type"] == expected
 
@@ -193,7 +193,7 @@ def test_accept_picks_the_form(client, accept, modality, expected):
     ("accept", "modality"),
     [("image/webp", "rgb"), ("image/jpeg", "depth"), ("*/*;q=0", "rgb"), ("image/png;q=x", "rgb")],
 )
-def test_a_form_that_is_not_offered_is_refused_with_those_that_are(client, accept, modality):
+def test_an_unsupported_format_is_refused_with_the_supported_ones(client, accept, modality):
     url = f"{RENDER}?camera=front&modality={modality}"
     problem = client.get(url, headers={"Accept": accept}).json()
     assert problem["code"] == ErrorCode.NOT_ACCEPTABLE

@@ -1,4 +1,4 @@
-"""What is sent for drawing is the scene's Gaussians, to the rounding of the format."""
+"""Splats sent to the browser equal the scene's Gaussians up to the rounding of the format."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def same_to_rounding(sent, cloud):
     assert (sent.quats * cloud.quats).sum(dim=1).abs().min() > 1 - 1e-4
 
 
-def test_all_parts_together_are_the_background_what_covers_most_first(client, tiny_scene, tmp_path):
+def test_the_parts_add_up_to_the_background_ordered_by_importance(client, tiny_scene, tmp_path):
     background = tiny_scene.background
     parts = []
     for first in (0, 128, 256):
@@ -57,14 +57,14 @@ def test_importance_is_opacity_times_area(tiny_scene):
     assert cloud.by_importance().tolist() == [0, 2, 1, 3]
 
 
-def test_an_object_comes_in_its_own_frame(client, tiny_scene, tmp_path):
+def test_an_object_is_sent_in_its_own_frame(client, tiny_scene, tmp_path):
     cloud = tiny_scene.object("car_red").cloud
     sent, total = received(client, tmp_path, object_id="car_red")
     assert total == len(cloud)
     same_to_rounding(sent, cloud.select(cloud.by_importance()))
 
 
-def test_what_is_not_there_is_said(client):
+def test_an_unknown_object_or_hash_is_not_found(client):
     answer = client.get("/v1/scenes/tiny/splats", params={"object_id": "nobody"})
     assert (answer.status_code, answer.json()["code"]) == (404, "UNKNOWN_OBJECT")
     for part in ("splats", "sky"):
@@ -72,7 +72,7 @@ def test_what_is_not_there_is_said(client):
         assert (other.status_code, other.json()["code"]) == (404, "NOT_FOUND")
 
 
-def test_who_knows_the_hash_may_keep_it_and_others_ask(client):
+def test_a_response_is_cacheable_only_with_a_content_hash(client):
     known = client.get("/v1/scenes/tiny").json()["content_hash"]
     for part in ("splats", "sky"):
         url = f"/v1/scenes/tiny/{part}"
@@ -112,7 +112,7 @@ def test_a_cloud_is_sorted_once_and_each_part_packed_once(tiny_scene, monkeypatc
     assert len(sorted_) == 2
 
 
-def test_what_was_not_used_for_long_makes_room(tiny_scene):
+def test_the_least_recently_used_part_is_evicted(tiny_scene):
     cloud = tiny_scene.background
     one = len(SplatFiles().part(cloud, ("a", ""), 0, 128))
     files = SplatFiles(most_bytes=4 * len(cloud) + 2 * one + one // 2)
@@ -124,7 +124,7 @@ def test_what_was_not_used_for_long_makes_room(tiny_scene):
     assert files.held_bytes <= 4 * len(cloud) + 2 * one + one // 2
 
 
-def test_whoever_walks_comes_in_the_rest_pose_and_that_is_said(run_worker, scenes_dir, tiny_scene):
+def test_a_person_is_sent_in_the_rest_pose_with_a_header(run_worker, scenes_dir, tiny_scene):
     asset = person_asset("anna", "woman", height=1.7, gaussians=400)
     red = tiny_scene.object("car_red")
     anna = SceneObject(
@@ -140,7 +140,7 @@ def test_whoever_walks_comes_in_the_rest_pose_and_that_is_said(run_worker, scene
     assert "X-Real2Sim-Figure" not in standing.headers
 
 
-def test_an_object_of_a_scenario_comes_as_the_scenario_has_it(client, tiny_scene, tmp_path):
+def test_an_object_of_a_scenario_is_sent_as_edited(client, tiny_scene, tmp_path):
     client.post("/v1/assets", json={"asset_id": "anna", "build": "woman", "height": 1.7})
     made = client.post("/v1/scenarios", json={"scene": "tiny"}).json()["scenario_id"]
     pose = {"position": [9.0, 1.0, 0.9]}

@@ -9,7 +9,7 @@ import pytest
 
 @pytest.fixture(scope="session")
 def s3_server() -> Iterator[int]:
-    """The port of an object store of the tests' own, which speaks S3."""
+    """Port of a local S3-compatible object store."""
     server_of = pytest.importorskip("moto.server", reason="needs moto: pip install 'real2sim[dev]'")
     pytest.importorskip("obstore", reason="needs obstore: pip install 'real2sim[objects]'")
     server = server_of.ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
@@ -20,7 +20,7 @@ def s3_server() -> Iterator[int]:
 
 @pytest.fixture(params=["file", "s3"])
 def objects_url(request, tmp_path, monkeypatch) -> str:
-    """An empty store of objects of each kind; what holds for one holds for the other."""
+    """URL of an empty object store of each kind."""
     if request.param == "file":
         return f"file://{tmp_path / 'objects'}"
     port: int = request.getfixturevalue("s3_server")

@@ -1,4 +1,4 @@
-"""What every store of objects promises, and bundles that go through it."""
+"""Guarantees of every object store, and bundles transferred through it."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def file(tmp_path):
     return path
 
 
-def test_an_object_is_found_by_its_digest_and_read_in_parts(objects, file):
+def test_an_object_is_found_by_digest_and_read_by_range(objects, file):
     assert objects.find(DIGEST) is None
     for _ in range(2):
         objects.put(file, DIGEST)
@@ -46,18 +46,18 @@ def test_an_object_is_found_by_its_digest_and_read_in_parts(objects, file):
     assert list(objects.list()) == []
 
 
-def test_what_is_not_there_is_told(objects):
+def test_reading_a_missing_object_fails(objects):
     with pytest.raises((ObjectStoreError, FileNotFoundError)):
         objects.read(DIGEST, 0, 1)
     objects.remove(DIGEST)
 
 
-def test_only_digests_are_names(objects, file):
+def test_an_object_name_must_be_a_digest(objects, file):
     with pytest.raises(ValueError, match="not an SHA-256"):
         objects.put(file, "../../etc/passwd")
 
 
-def test_a_signed_address_gives_the_object_to_anybody(objects, file, objects_url):
+def test_a_signed_url_gives_access_without_credentials(objects, file, objects_url):
     objects.put(file, DIGEST)
     url = objects.signed_url(DIGEST, 60)
     if objects_url.startswith("file"):
@@ -68,12 +68,12 @@ def test_a_signed_address_gives_the_object_to_anybody(objects, file, objects_url
 
 
 @pytest.mark.parametrize("url", ["http://x", "file:", "s3://", "s3://b/p?colour=red"])
-def test_another_url_is_refused(url):
+def test_an_unsupported_url_is_refused(url):
     with pytest.raises(ValueError, match=r"object store|only endpoint"):
         open_objects(url)
 
 
-def test_a_store_that_is_gone_is_told(file, monkeypatch):
+def test_an_unreachable_store_raises_an_error(file, monkeypatch):
     monkeypatch.setenv("AWS_ACCESS_KEY_ID", "tests")
     monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "tests")
     monkeypatch.setattr(shared_objects, "RETRIES", 0)
@@ -86,7 +86,7 @@ def test_a_store_that_is_gone_is_told(file, monkeypatch):
 
 
 class Site:
-    """A worker's folders on a store of objects."""
+    """A worker's folders attached to an object store."""
 
     def __init__(self, root, objects, max_bytes=1 << 30) -> None:
         self.folders = {kind: root / kind for kind in ("scene", "asset", "job")}
@@ -101,7 +101,7 @@ class Site:
         return self.bundles.put("scene", name, folder)
 
 
-def test_a_bundle_is_the_same_where_it_is_taken_out(objects, tmp_path):
+def test_a_bundle_is_identical_after_the_transfer(objects, tmp_path):
     made = Site(tmp_path / "a", objects).make("street")
     bundle = SharedBundle.of_document("scene", "street", made.document())
     assert bundle == made
@@ -113,7 +113,7 @@ def test_a_bundle_is_the_same_where_it_is_taken_out(objects, tmp_path):
     assert site.bundles.own("scene") == []
 
 
-def test_what_was_taken_out_goes_in_the_order_of_its_last_use(tmp_path):
+def test_downloaded_bundles_are_evicted_least_recently_used_first(tmp_path):
     objects = open_objects(f"file://{tmp_path / 'objects'}")
     maker = Site(tmp_path / "a", objects)
     bundles = [maker.make(name) for name in ("one", "two", "six")]
@@ -126,7 +126,7 @@ def test_what_was_taken_out_goes_in_the_order_of_its_last_use(tmp_path):
     assert [p.exists() for p in (first, second, third)] == [True, False, True]
 
 
-def test_what_was_made_here_is_never_dropped(tmp_path):
+def test_local_bundles_are_never_evicted(tmp_path):
     objects = open_objects(f"file://{tmp_path / 'objects'}")
     site = Site(tmp_path / "a", objects, max_bytes=1)
     site.make("one")
@@ -135,7 +135,7 @@ def test_what_was_made_here_is_never_dropped(tmp_path):
     assert [p.name for p in site.bundles.own("scene")] == ["one.r2s"]
 
 
-def test_a_damaged_object_is_not_taken_for_the_bundle(tmp_path):
+def test_a_corrupt_object_is_refused(tmp_path):
     objects = open_objects(f"file://{tmp_path / 'objects'}")
     bundle = Site(tmp_path / "a", objects).make("street")
     digest = bundle.files[0].digest
@@ -146,7 +146,7 @@ def test_a_damaged_object_is_not_taken_for_the_bundle(tmp_path):
     assert list(site.folders["scene"].glob("*")) == []
 
 
-def test_a_bundle_cannot_lead_out_of_its_folder(tmp_path, file):
+def test_a_bundle_file_outside_its_folder_is_refused(tmp_path, file):
     objects = open_objects(f"file://{tmp_path / 'objects'}")
     objects.put(file, DIGEST)
     document = f'{{"folder": "x.r2s", "files": [["../../evil", "{DIGEST}", {len(CONTENT)}]]}}'
@@ -156,7 +156,7 @@ def test_a_bundle_cannot_lead_out_of_its_folder(tmp_path, file):
         )
 
 
-def test_objects_that_no_bundle_has_go_after_a_day(tmp_path, file):
+def test_unreferenced_objects_are_removed_after_a_day(tmp_path, file):
     folder = tmp_path / "objects"
     objects = open_objects(f"file://{folder}")
     site = Site(tmp_path / "a", objects)

@@ -1,4 +1,4 @@
-"""Workers with folders of their own, one database and one store of objects."""
+"""Workers with separate folders that share a database and an object store."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def quick(monkeypatch):
 
 @pytest.fixture
 def start(start_worker, tmp_path, scenes_dir) -> Callable:
-    """Starts workers; only the first, ``w0``, has scenes in its folder."""
+    """Start workers. Only the first, ``w0``, has scenes in its folder."""
 
     def start(worker_id: str, objects_url: str = f"file://{tmp_path / 'objects'}"):
         folder = tmp_path / worker_id
@@ -48,16 +48,16 @@ def shared(client) -> set[tuple[str, str]]:
 
 
 def wait_shared(client, kind: str, name: str) -> None:
-    """Return once the store of objects has it."""
+    """Wait until the object store has the bundle."""
     wait_until(lambda: (kind, name) in shared(client), f"{kind} {name} to be shared")
 
 
 def wait_status(client, path: str, status: int) -> None:
-    """Return once a GET is answered so."""
+    """Wait until a GET returns this status."""
     wait_until(lambda: client.get(path).status_code == status, f"{status} for {path}")
 
 
-def test_a_session_begins_where_its_scene_is_not(start, objects_url):
+def test_a_session_starts_on_a_worker_without_the_scene(start, objects_url):
     first = start("w0", objects_url)
     wait_shared(first, "scene", "tiny")
     second = start("w1", objects_url)
@@ -69,11 +69,11 @@ def test_a_session_begins_where_its_scene_is_not(start, objects_url):
     assert Site(second).step().status_code == 200
 
 
-def test_a_scene_that_nobody_has_is_unknown_as_ever(start):
+def test_a_scene_missing_everywhere_is_unknown(start):
     assert start("w1").get("/v1/scenes/nowhere").json()["code"] == "UNKNOWN_SCENE"
 
 
-def test_files_of_a_job_are_had_from_any_worker(start, objects_url):
+def test_job_files_are_available_from_any_worker(start, objects_url):
     first = start("w0", objects_url)
     body = {"scene": "tiny", "camera": "front", "width": 64, "fps": 2}
     asked = first.post("/v1/exports", json=body)
@@ -95,21 +95,21 @@ def test_files_of_a_job_are_had_from_any_worker(start, objects_url):
     wait_until(lambda: ("job", job.rpartition("/")[2]) not in shared(second), "its files to go")
 
 
-def test_an_asset_is_everywhere_and_gone_everywhere(start):
+def test_an_asset_is_added_and_deleted_on_all_workers(start):
     first, second = start("w0"), start("w1")
     assert first.post("/v1/assets", json=CUT).status_code == 201
     wait_status(second, "/v1/assets/red", 200)
     assert second.get("/v1/assets/red").json() == first.get("/v1/assets/red").json()
     assert second.delete("/v1/assets/red").status_code == 204
     wait_status(first, "/v1/assets/red", 404)
-    # Its id may be given again, to something else.
+    # The id can be reused for a different asset.
     again = CUT | {"object_id": "post"}
     assert first.post("/v1/assets", json=again).status_code == 201
     wait_status(second, "/v1/assets/red", 200)
     assert second.get("/v1/assets/red").json() == first.get("/v1/assets/red").json()
 
 
-def test_a_store_of_objects_that_is_gone_is_told_and_may_come_back(start, monkeypatch, tmp_path):
+def test_an_unavailable_object_store_is_reported_and_recovers(start, monkeypatch, tmp_path):
     first = start("w0")
     wait_shared(first, "scene", "tiny")
     second = start("w1")
@@ -122,7 +122,7 @@ def test_a_store_of_objects_that_is_gone_is_told_and_may_come_back(start, monkey
     assert second.post("/v1/sessions?scene=tiny", json={}).status_code == 201
 
 
-def test_no_step_waits_for_the_store_of_objects(start, monkeypatch):
+def test_steps_do_not_wait_for_the_object_store(start, monkeypatch):
     waiting, released, put = threading.Event(), threading.Event(), FolderObjects.put
 
     def stuck(self, file, digest) -> None:

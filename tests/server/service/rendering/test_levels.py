@@ -1,4 +1,4 @@
-"""What small images are drawn from is counted, and made before the engine needs it."""
+"""Detail levels for small images: their memory, and their construction off the engine thread."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SMALL = {"action": "control", "sensors": [{"camera": "front", "detail": "auto"}]
 
 @pytest.fixture
 def makers(monkeypatch) -> list[str]:
-    """Names of the threads on which levels were made."""
+    """Names of the threads that built detail levels."""
     names: list[str] = []
     make = detail_levels.make_hierarchy
 
@@ -46,7 +46,7 @@ def make_ready(scene, levels: DetailLevels, **sensor: object) -> None:
 
 
 @pytest.mark.network
-def test_a_session_with_a_small_camera_waits_for_them_and_the_engine_does_not(client, makers):
+def test_a_session_with_a_small_camera_builds_levels_off_the_engine_thread(client, makers):
     wait_ready(client)
     client.portal.call(client.app.state.worker.renderer.small_images.ready)
     makers.clear()
@@ -70,7 +70,7 @@ def test_a_session_with_a_small_camera_waits_for_them_and_the_engine_does_not(cl
 
 
 @pytest.mark.network
-def test_an_edit_of_a_running_world_waits_for_them_and_the_engine_does_not(client, makers):
+def test_an_edit_of_a_running_world_builds_levels_off_the_engine_thread(client, makers):
     wait_ready(client)
     made = client.post("/v1/sessions", params={"scene": "tiny"}, json={"reset": SMALL}).json()
     session = f"/v1/sessions/{made['session_id']}"
@@ -86,7 +86,7 @@ def test_an_edit_of_a_running_world_waits_for_them_and_the_engine_does_not(clien
     assert len(makers) == 1
 
 
-def test_they_are_counted_with_their_scene(tiny_scene, makers):
+def test_level_memory_is_counted_per_scene(tiny_scene, makers):
     budget = MemoryBudget(10**9)
     levels = DetailLevels(select_backend("cpu"), budget)
     before = levels_bytes()
@@ -98,12 +98,12 @@ def test_they_are_counted_with_their_scene(tiny_scene, makers):
 
 
 @pytest.mark.parametrize("sensor", [{"detail": "full"}, {"width": 1000}])
-def test_other_images_need_none(makers, sensor):
+def test_full_detail_and_large_images_need_no_levels(makers, sensor):
     make_ready(make_tiny_scene(), DetailLevels(select_backend("cpu")), **sensor)
     assert makers == []
 
 
-def test_where_they_do_not_fit_the_answer_says_so(makers):
+def test_levels_over_the_memory_budget_are_refused(makers):
     levels = DetailLevels(select_backend("cpu"), MemoryBudget(1000))
     with pytest.raises(ServiceError, match="small images") as refused:
         make_ready(make_tiny_scene(), levels)

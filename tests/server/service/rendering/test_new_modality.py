@@ -1,4 +1,4 @@
-"""A sensor modality is one module with a registration; nothing of the service changes for it."""
+"""A sensor modality is one module with a registration. It needs no change to the service."""
 
 from __future__ import annotations
 
@@ -46,8 +46,8 @@ def alpha() -> Iterator[SensorModality]:
 
 
 def rendered(scene: Scene, codec: str) -> list[EncodedFrame]:
-    """Frames of one camera for the modalities rgb and alpha."""
-    # Not validated: the schema of requests is a public contract and names the public ones.
+    """Frames of one camera in the modalities rgb and alpha."""
+    # Skip validation: the request schema is a public contract and only lists the public modalities.
     sensor = SensorSpec.model_construct(
         camera=scene.rig.names[0], modalities=["rgb", "alpha"], codec=codec
     )
@@ -78,7 +78,7 @@ def test_a_registered_modality_is_rendered_and_encoded(alpha, tiny_scene, codec)
     assert frame.header.fields["dtype"] == "uint8"
 
 
-def test_its_frame_is_read_from_the_message_of_an_observation(alpha, tiny_scene):
+def test_a_frame_of_the_new_modality_is_decoded_from_an_observation(alpha, tiny_scene):
     frames = rendered(tiny_scene, "raw")
     message = pack_with_frames("obs", pack_members({"step": 1}), frames, PhaseTimer())
     received = decode(message.joined(3))["frames"][1]

@@ -1,4 +1,4 @@
-"""Lenses and effects of cameras anywhere, over the wire."""
+"""Lenses and effects of free cameras over REST."""
 
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ def image(frame):
     return np.frombuffer(frame["data"], frame["dtype"]).reshape(frame["shape"])
 
 
-def test_a_view_through_a_fisheye_is_round_and_says_so(client):
+def test_a_fisheye_view_is_circular_and_names_its_lens(client):
     rgb, depth = frames(client, lens=FISHEYE, modalities=["rgb", "depth"])
     assert (rgb["lens"], depth["lens"]) == ("fisheye", "fisheye")
     assert not image(rgb)[0, 0].any()
@@ -35,7 +35,7 @@ def test_a_view_through_a_fisheye_is_round_and_says_so(client):
     assert image(depth)[0, 0] == 0
 
 
-def test_effects_act_on_colours_and_are_named(client):
+def test_effects_change_colours_only_and_are_listed(client):
     plain = frames(client, modalities=["rgb", "depth"])
     bright = frames(client, modalities=["rgb", "depth"], effects={"exposure_ev": 1.0})
     assert "effects" not in plain[0]
@@ -54,7 +54,7 @@ def test_effects_act_on_colours_and_are_named(client):
         ({"model": "fisheye", "k": [1.0]}, "k"),
     ],
 )
-def test_a_lens_that_is_none_is_refused_with_the_reason(client, lens, said):
+def test_an_invalid_lens_is_refused_with_the_reason(client, lens, said):
     answer = client.post(VIEW, json={"cameras": [EYE | {"lens": lens}]})
     assert answer.status_code in {400, 422}
     assert answer.json()["code"] == ErrorCode.INVALID_REQUEST

@@ -1,4 +1,4 @@
-"""Images of uncertainty over the wire, of scenes that know it and of those that do not."""
+"""Uncertainty images over REST, for scenes with and without uncertainties."""
 
 import json
 import struct
@@ -25,7 +25,7 @@ MSGPACK = {"Accept": "application/msgpack"}
 
 @pytest.fixture
 def known(scenes_dir, tiny_scene, start_worker):
-    """A worker with a scene ``tiny`` that knows nothing and a scene ``known`` that does."""
+    """A worker with a scene ``tiny`` without uncertainties and a scene ``known`` with them."""
     background = replace(
         tiny_scene.background, uncertainties=torch.full((len(tiny_scene.background),), 0.02)
     )
@@ -37,7 +37,7 @@ def rendered(client, scene):
     return client.post(f"/v1/scenes/{scene}/render", json={"cameras": [CAMERA]}, headers=MSGPACK)
 
 
-def test_scenes_say_whether_they_have_them_and_give_or_refuse_them(known):
+def test_uncertainty_images_are_rendered_only_for_scenes_that_have_them(known):
     answer = rendered(known, "known")
     assert answer.status_code == 200, answer.text
     frame = decode(answer.content)["frames"][1]
@@ -51,7 +51,7 @@ def test_scenes_say_whether_they_have_them_and_give_or_refuse_them(known):
     assert [said[name]["has_uncertainties"] for name in said] == [True, False]
 
 
-def test_sessions_show_them_and_refuse_them_before_they_begin(known):
+def test_a_session_with_uncertainty_images_is_refused_for_a_scene_without_them(known):
     sensors = [{"camera": "front", "modalities": ["uncertainty"], "codec": "png", "width": 48}]
 
     def begin(scene):
@@ -75,7 +75,7 @@ def test_sessions_show_them_and_refuse_them_before_they_begin(known):
     assert (frame["modality"], frame["dtype"], frame["codec"]) == ("uncertainty", "uint16", "png")
 
 
-def test_the_studio_gets_them_in_colours(known):
+def test_the_studio_view_shows_uncertainty_in_colour(known):
     made = known.post("/v1/scenarios", json={"scene": "known"}).json()
     path = f"/v1/scenarios/{made['scenario_id']}/view"
     pictures = []

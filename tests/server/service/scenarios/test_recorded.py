@@ -1,4 +1,4 @@
-"""A scene as it was recorded is looked at as a scenario is, and nobody can change it."""
+"""The recorded scene can be viewed like a scenario but is read-only."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ def recorded(client) -> str:
     return f"/v1/scenarios/recorded.{client.get('/v1/scenes/tiny').json()['content_hash']}"
 
 
-def test_it_shows_what_a_new_scenario_shows_and_is_in_no_list(client, recorded):
+def test_the_recording_equals_a_new_scenario_and_is_not_listed(client, recorded):
     told = client.get(recorded).json()
     assert client.get("/v1/scenarios").json()["scenarios"] == []
     made = client.post("/v1/scenarios", json={"scene": "tiny"}).json()
@@ -25,7 +25,7 @@ def test_it_shows_what_a_new_scenario_shows_and_is_in_no_list(client, recorded):
     assert client.get(f"{recorded}/operations").json()["entries"] == []
 
 
-def test_it_cannot_be_changed_and_a_fork_of_it_can(client, recorded):
+def test_the_recording_is_read_only_but_its_fork_is_not(client, recorded):
     edit = {"operations": [{"op": "delete", "object_id": "car_red"}]}
     refused = [
         client.post(f"{recorded}/operations", json=edit),
@@ -41,6 +41,6 @@ def test_it_cannot_be_changed_and_a_fork_of_it_can(client, recorded):
     assert client.post(f"/v1/scenarios/{forked}/operations", json=edit).status_code == 200
 
 
-def test_no_scene_no_recording(client):
+def test_a_recording_of_an_unknown_scene_is_not_found(client):
     answer = client.get(f"/v1/scenarios/recorded.{'0' * 64}")
     assert (answer.status_code, answer.json()["code"]) == (404, "UNKNOWN_SCENARIO")

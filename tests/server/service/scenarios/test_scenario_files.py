@@ -1,4 +1,4 @@
-"""Forks, files and the names in the history."""
+"""Forks, files and author names in the history."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ COPY = {"op": "duplicate", "object_id": "car_red", "new_id": "twin", "y": 6.0}
 
 @pytest.fixture
 def edited(client) -> str:
-    """A scenario with two edits, one undone and redone."""
+    """A scenario with two edits, one of them undone and redone."""
     scenario = client.post("/v1/scenarios", json={"scene": "tiny", "name": "cut-in"}).json()
     url = f"/v1/scenarios/{scenario['scenario_id']}"
     for operation in (MOVE, COPY):
@@ -30,7 +30,7 @@ def described(client, url) -> dict:
     return {k: v for k, v in info.items() if k not in {"scenario_id", "created_at"}}
 
 
-def test_the_history_tells_who_did_what_when(client):
+def test_the_history_records_author_kind_and_time(client):
     scenario = client.post("/v1/scenarios", json={"scene": "tiny"}).json()["scenario_id"]
     url = f"/v1/scenarios/{scenario}"
     headers = {"X-Real2Sim-Client": "anna"}
@@ -41,13 +41,13 @@ def test_the_history_tells_who_did_what_when(client):
     assert all(e["created_at"].endswith("+00:00") for e in entries)
 
 
-def test_a_name_that_is_none_is_refused(client):
+def test_an_invalid_author_name_is_refused(client):
     scenario = client.post("/v1/scenarios", json={"scene": "tiny"}).json()["scenario_id"]
     answer = client.post(f"/v1/scenarios/{scenario}/undo", headers={"X-Real2Sim-Client": "a" * 81})
     assert answer.json()["code"] == ErrorCode.INVALID_REQUEST
 
 
-def test_a_fork_has_the_same_history_and_goes_its_own_way(client, edited):
+def test_a_fork_copies_the_history_and_evolves_independently(client, edited):
     answer = client.post(f"{edited}/fork", json={"name": "other"})
     fork = ScenarioInfo.model_validate(answer.json())
     fork_url = answer.headers["Location"]
@@ -59,7 +59,7 @@ def test_a_fork_has_the_same_history_and_goes_its_own_way(client, edited):
     assert client.get(edited).json()["revision"] == 4
 
 
-def test_a_fork_can_begin_at_an_earlier_revision(client, edited):
+def test_a_fork_can_start_at_an_earlier_revision(client, edited):
     fork = client.post(f"{edited}/fork", json={"revision": 1}).json()
     assert (fork["revision"], fork["name"]) == (1, "cut-in")
     assert "twin" not in [o["object_id"] for o in fork["objects"]]
@@ -70,7 +70,7 @@ def test_a_fork_beyond_the_history_is_refused(client, edited):
     assert answer.json()["code"] == ErrorCode.INVALID_REQUEST
 
 
-def test_an_exported_scenario_comes_back_with_its_history(client, edited):
+def test_an_exported_scenario_is_imported_with_its_history(client, edited):
     answer = client.get(f"{edited}/export")
     document = ScenarioDocument.model_validate(answer.json())
     assert answer.headers["Content-Disposition"].endswith('.scenario.json"')
@@ -83,7 +83,7 @@ def test_an_exported_scenario_comes_back_with_its_history(client, edited):
     assert client.post(f"{url}/undo").status_code == 200
 
 
-def test_a_file_is_carried_to_another_worker_and_survives_its_restart(
+def test_a_scenario_imported_by_another_worker_survives_a_restart(
     client, edited, run_worker, tmp_path
 ):
     document = client.get(f"{edited}/export").json()
@@ -102,7 +102,7 @@ def test_a_file_is_carried_to_another_worker_and_survives_its_restart(
         ({"assets": {"van": "0" * 64}}, ErrorCode.UNKNOWN_ASSET),
     ],
 )
-def test_a_file_that_does_not_fit_is_refused(client, edited, change, code):
+def test_an_incompatible_file_is_refused(client, edited, change, code):
     document = client.get(f"{edited}/export").json()
     answer = client.post("/v1/scenarios/import", json=document | change)
     assert answer.json()["code"] == code

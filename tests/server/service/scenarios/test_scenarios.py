@@ -50,7 +50,7 @@ def test_a_new_scenario_shows_the_scene_as_recorded(client):
     assert not info.can_redo
 
 
-def test_operations_take_effect_and_raise_the_revision(client):
+def test_operations_are_applied_and_increase_the_revision(client):
     scenario = create(client)
     response = edit(client, scenario, DELETE_RED, MOVE_POST)
     result = OperationResult.model_validate(response.json())
@@ -61,7 +61,7 @@ def test_operations_take_effect_and_raise_the_revision(client):
     assert objects["post"]["trajectory"]["positions"][0] == [11.5, 3.5, 1.0]
 
 
-def test_created_objects_inverse_and_warnings_are_told(client):
+def test_an_edit_returns_created_objects_inverse_and_warnings(client):
     scenario = create(client)
     overlapping = COPY_RED | {"y": 1.0}
     result = OperationResult.model_validate(edit(client, scenario, overlapping).json())
@@ -71,7 +71,7 @@ def test_created_objects_inverse_and_warnings_are_told(client):
     assert shown(client, scenario)["twin"]["instance_id"] == 4
 
 
-def test_a_batch_takes_effect_as_a_whole_or_not_at_all(client):
+def test_a_batch_is_applied_completely_or_not_at_all(client):
     scenario = create(client)
     response = edit(client, scenario, MOVE_POST, DELETE_RED | {"object_id": "nobody"})
     assert response.status_code == 404
@@ -80,7 +80,7 @@ def test_a_batch_takes_effect_as_a_whole_or_not_at_all(client):
     assert shown(client, scenario)["post"]["trajectory"]["positions"][0] == [10.0, 3.5, 1.0]
 
 
-def test_a_dry_run_answers_and_changes_nothing(client):
+def test_a_dry_run_changes_nothing(client):
     scenario = create(client)
     result = edit(client, scenario, COPY_RED, dry_run=True).json()
     assert (result["dry_run"], result["created"], result["revision"]) == (True, ["twin"], 0)
@@ -88,13 +88,13 @@ def test_a_dry_run_answers_and_changes_nothing(client):
     assert edit(client, scenario, MOVE_POST).json()["revision"] == 1
 
 
-def test_an_edit_for_the_present_revision_is_taken(client):
+def test_an_edit_for_the_current_revision_is_accepted(client):
     scenario = create(client)
     assert edit(client, scenario, MOVE_POST, headers={"If-Match": '"r0"'}).status_code == 200
     assert edit(client, scenario, MOVE_POST, headers={"If-Match": "*"}).status_code == 200
 
 
-def test_a_stale_edit_is_refused_with_what_it_missed(client):
+def test_a_stale_edit_is_refused_with_the_missed_operations(client):
     scenario = create(client)
     edit(client, scenario, MOVE_POST)
     edit(client, scenario, DELETE_RED)
@@ -116,12 +116,12 @@ def test_undo_and_redo_are_refused_when_stale(client, name):
 
 
 @pytest.mark.parametrize("tag", ["r1", "1", '"1"', 'W/"r1"', '"r-1"', '"r1", "r2"'])
-def test_an_if_match_that_is_no_revision_is_refused(client, tag):
+def test_an_invalid_if_match_is_refused(client, tag):
     response = edit(client, create(client), MOVE_POST, headers={"If-Match": tag})
     assert response.json()["code"] == ErrorCode.INVALID_REQUEST
 
 
-def test_undo_and_redo_go_back_and_forth(client):
+def test_undo_and_redo_restore_states(client):
     scenario = create(client)
     edit(client, scenario, DELETE_RED)
     undone = act(client, scenario, "undo").json()
@@ -131,13 +131,13 @@ def test_undo_and_redo_go_back_and_forth(client):
     assert "car_red" not in shown(client, scenario)
 
 
-def test_there_is_nothing_to_undo_or_redo_at_first(client):
+def test_a_new_scenario_has_nothing_to_undo_or_redo(client):
     scenario = create(client)
     assert act(client, scenario, "undo").json()["code"] == ErrorCode.NOTHING_TO_UNDO
     assert act(client, scenario, "redo").json()["code"] == ErrorCode.NOTHING_TO_REDO
 
 
-def test_history_tells_every_revision(client):
+def test_the_history_lists_every_revision(client):
     scenario = create(client)
     edit(client, scenario, DELETE_RED)
     act(client, scenario, "undo")
@@ -151,7 +151,7 @@ def test_history_tells_every_revision(client):
     assert [e["revision"] for e in client.get(f"{url}?after=1").json()["entries"]] == [2]
 
 
-def test_the_list_tells_revision_and_what_can_be_undone(client):
+def test_the_list_includes_revision_and_undo_state(client):
     first, second = create(client, name="a"), create(client, name="b")
     edit(client, first, MOVE_POST)
     edit(client, first, DELETE_RED)
@@ -203,14 +203,14 @@ def test_a_scenario_on_an_unknown_or_broken_scene_is_refused(client, scenes_dir)
         ),
     ],
 )
-def test_operations_that_make_no_sense_are_refused_with_their_place(client, operation, pointer):
+def test_invalid_operations_are_refused_with_a_pointer(client, operation, pointer):
     response = edit(client, create(client), operation)
     assert response.status_code == 422
     assert response.json()["errors"][0]["pointer"] == pointer
 
 
 @pytest.mark.parametrize("value", ["NaN", "Infinity", "1e400"])
-def test_numbers_that_are_not_finite_are_refused(client, value):
+def test_non_finite_numbers_are_refused(client, value):
     scenario = create(client)
     response = client.post(
         f"/v1/scenarios/{scenario.scenario_id}/operations",
@@ -240,7 +240,7 @@ def test_a_preview_shows_the_edits(client):
     assert 4 in seen()
 
 
-def test_a_preview_names_its_revision(client):
+def test_a_preview_reports_its_revision(client):
     scenario = create(client)
     edit(client, scenario, MOVE_POST)
     response = client.get(f"/v1/scenarios/{scenario.scenario_id}/preview?camera=front&width=48")
@@ -248,7 +248,7 @@ def test_a_preview_names_its_revision(client):
     assert response.headers["Content-Type"] == "image/jpeg"
 
 
-def test_scenarios_survive_a_restart_of_the_worker(start_worker, run_worker):
+def test_scenarios_survive_a_worker_restart(start_worker, run_worker):
     with run_worker() as first:
         scenario = create(first, name="kept")
         edit(first, scenario, DELETE_RED, MOVE_POST)
@@ -262,9 +262,7 @@ def test_scenarios_survive_a_restart_of_the_worker(start_worker, run_worker):
 
 
 @pytest.mark.parametrize("damage", [None, b"no state", b""])
-def test_a_snapshot_spares_replaying_and_is_never_needed(
-    run_worker, start_worker, monkeypatch, damage
-):
+def test_a_snapshot_saves_replaying_but_is_optional(run_worker, start_worker, monkeypatch, damage):
     monkeypatch.setattr(scenario_cache, "INTERVAL", 2)
     with run_worker() as first:
         scenario = create(first)
@@ -292,7 +290,7 @@ def test_a_snapshot_spares_replaying_and_is_never_needed(
     assert set(shown(second, scenario)) == {"car_red", "car_blue", "post"}
 
 
-def test_nothing_takes_effect_that_is_not_on_record(client, monkeypatch):
+def test_an_edit_that_cannot_be_recorded_has_no_effect(client, monkeypatch):
     scenario = create(client)
 
     def fail(*_args, **_kwargs):
@@ -305,7 +303,7 @@ def test_nothing_takes_effect_that_is_not_on_record(client, monkeypatch):
     assert edit(client, scenario, DELETE_RED).json()["revision"] == 1
 
 
-def test_edits_that_arrive_together_are_made_one_after_the_other(client):
+def test_concurrent_edits_are_applied_one_after_the_other(client):
     scenario = create(client)
     with ThreadPoolExecutor(8) as pool:
         results = list(pool.map(lambda _: edit(client, scenario, MOVE_POST).json(), range(16)))
@@ -313,7 +311,7 @@ def test_edits_that_arrive_together_are_made_one_after_the_other(client):
     assert shown(client, scenario)["post"]["trajectory"]["positions"][0] == [34.0, 3.5, 1.0]
 
 
-def test_of_two_edits_for_one_revision_one_is_refused(client):
+def test_only_one_of_several_edits_for_one_revision_is_applied(client):
     scenario = create(client)
     headers = {"If-Match": '"r0"'}
     with ThreadPoolExecutor(4) as pool:
@@ -325,7 +323,7 @@ def test_of_two_edits_for_one_revision_one_is_refused(client):
     assert sorted(statuses) == [200, 412, 412, 412]
 
 
-def test_a_cancelled_edit_is_on_record_or_not_but_never_half(client):
+def test_a_cancelled_edit_is_recorded_completely_or_not_at_all(client):
     scenario = create(client)
     worker = client.app.state.worker
 
@@ -357,7 +355,7 @@ def test_a_cancelled_edit_is_on_record_or_not_but_never_half(client):
         assert x == pytest.approx(10 + 1.5 * revision)
 
 
-def test_a_scenario_whose_scene_was_replaced_says_so(
+def test_a_scenario_whose_scene_was_replaced_is_broken(
     start_worker, run_worker, scenes_dir, tiny_scene
 ):
     with run_worker() as first:

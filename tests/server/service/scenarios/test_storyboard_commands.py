@@ -1,4 +1,4 @@
-"""``real2sim scenario`` and ``real2sim drive`` against a worker, as a user has them."""
+"""``real2sim scenario`` and ``real2sim drive`` against a worker."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ def worker(make_settings):
 
 
 def printed(worker, *words: str) -> str:
-    """What a command prints, whatever its exit code."""
+    """Output of a command, regardless of its exit code."""
     result = CliRunner().invoke(build_app(), [*words, "--url", worker.url])
     hint = getattr(result.exception, "hint", None) or ""
     return f"{result.output}{result.exception or ''} {hint}"
 
 
-def test_a_case_of_the_gallery_goes_out_as_a_file_comes_in_and_is_driven(worker, tmp_path):
+def test_a_gallery_case_is_exported_edited_imported_and_driven(worker, tmp_path):
     file = tmp_path / "ccrb.xosc"
     applied = printed(worker, "scenario", "apply", "ccrb", "--scene", "tiny", "--set", "gap=9")
     scenario = re.search(r"sc_\w+", applied).group()
@@ -55,7 +55,7 @@ class Mine:
 
 
 @pytest.mark.parametrize("asks", ["by its class", "by --reset"])
-def test_an_own_planner_sees_pictures_and_sends_controls(worker, tmp_path, monkeypatch, asks):
+def test_a_custom_planner_receives_images_and_sends_controls(worker, tmp_path, monkeypatch, asks):
     monkeypatch.chdir(tmp_path)
     head = needs = ""
     options: tuple[str, ...] = ()
@@ -71,7 +71,7 @@ def test_an_own_planner_sees_pictures_and_sends_controls(worker, tmp_path, monke
     assert "2 steps" in printed(worker, *words)
 
 
-def test_a_planner_that_does_not_say_what_it_needs_is_told_the_line(worker, tmp_path, monkeypatch):
+def test_a_planner_without_needs_gets_the_missing_line_as_a_hint(worker, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     text = PLANNER.format(head="", needs="")
     (tmp_path / "blind.py").write_text(text)
@@ -82,13 +82,13 @@ def test_a_planner_that_does_not_say_what_it_needs_is_told_the_line(worker, tmp_
     assert "needs = Needs(action='control')" in printed(worker, *words, "steering:Mine")
 
 
-def test_an_option_of_reset_that_is_given_twice_is_refused_by_name(worker):
+def test_an_option_set_twice_is_refused_by_name(worker):
     words = ("drive", "--scene", "tiny", "--steps", "1", "--seed", "3", "--reset")
 
     assert "seed is set by both --seed and --reset" in printed(worker, *words, '{"seed": 4}')
 
 
-def test_a_token_with_the_end_of_its_line_is_sent_without_it(make_settings):
+def test_the_line_ending_of_a_token_is_stripped(make_settings):
     with running_worker(make_settings(token="correct-horse")) as worker:
         assert "ready" in printed(worker, "status", "--token", "correct-horse\r\n")
         told = printed(worker, "status", "--token", "correct-\rhorse")
@@ -96,7 +96,7 @@ def test_a_token_with_the_end_of_its_line_is_sent_without_it(make_settings):
     assert "horse" not in told
 
 
-def test_a_case_that_is_refused_leaves_no_scenario(worker):
+def test_a_refused_gallery_case_creates_no_scenario(worker):
     words = ("scenario", "apply", "ccrb", "--scene", "tiny", "--set", "gab=9")
     assert "no parameter 'gab'" in printed(worker, *words)
     with real2sim.connect(worker.url) as client:

@@ -1,4 +1,4 @@
-"""Storyboards of scenarios over REST: as JSON, as OpenSCENARIO files, and from the gallery."""
+"""Storyboards of scenarios over REST: JSON, OpenSCENARIO files and the gallery."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_a_storyboard_survives_a_fork_and_an_export(client, url):
     assert stored(client, copy.headers["Location"]) == board
 
 
-def test_an_export_of_an_earlier_version_keeps_its_rules(client, url):
+def test_an_export_of_an_earlier_version_keeps_its_version(client, url):
     client.post(f"{url}/corner-case", json={"name": "cut_in"})
     export = client.get(f"{url}/export").json()
     assert export["entries"][0]["operations"][0]["storyboard"].pop("version") == 2
@@ -58,7 +58,7 @@ def test_an_export_of_an_earlier_version_keeps_its_rules(client, url):
     assert stored(client, copy).version == 1
 
 
-def test_a_negative_time_is_refused_by_the_names_above_it(client, url):
+def test_a_negative_time_is_refused_with_the_path_to_it(client, url):
     board = corner_case("cut_in").storyboard().model_dump(mode="json")
     board["parameters"]["duration"] = -2.0
     told = client.put(f"{url}/storyboard", json=board).text
@@ -66,7 +66,7 @@ def test_a_negative_time_is_refused_by_the_names_above_it(client, url):
     assert "move_in_lane_change: the time of its dynamics is -2; it must be 0 or more" in told
 
 
-def test_a_file_goes_in_and_comes_out(client, url):
+def test_an_openscenario_file_round_trips(client, url):
     answer = client.put(f"{url}/storyboard.xosc", content=FILE, headers=XOSC)
 
     assert (answer.status_code, answer.json()["notes"]) == (200, [])
@@ -76,7 +76,7 @@ def test_a_file_goes_in_and_comes_out(client, url):
     assert out.content == FILE
 
 
-def test_a_file_is_refused_by_element_and_line(client, url):
+def test_an_unsupported_element_is_refused_with_its_line(client, url):
     text = FILE.decode().replace("LongitudinalAction>", "AppearanceAction>")
     line = text[: text.index("<AppearanceAction>")].count("\n") + 1
     refused = client.put(f"{url}/storyboard.xosc", content=text.encode(), headers=XOSC)
@@ -87,7 +87,7 @@ def test_a_file_is_refused_by_element_and_line(client, url):
     assert stored(client, url) is None
 
 
-def test_what_is_not_there_is_refused(client, url):
+def test_unknown_storyboards_cases_and_parameters_are_refused(client, url):
     assert "nothing is written" in client.get(f"{url}/storyboard.xosc").json()["detail"]
     for body, message in (
         ({"name": "cut_on"}, "the gallery has no 'cut_on'"),
@@ -96,14 +96,14 @@ def test_what_is_not_there_is_refused(client, url):
         assert message in client.post(f"{url}/corner-case", json=body).json()["detail"]
 
 
-def test_a_change_for_an_older_revision_is_refused(client, url):
+def test_a_change_for_a_stale_revision_is_refused(client, url):
     client.post(f"{url}/corner-case", json={"name": "ccrs"})
     headers = XOSC | {"If-Match": '"r0"'}
     stale = client.put(f"{url}/storyboard.xosc", content=FILE, headers=headers)
     assert stale.json()["code"] == ErrorCode.STALE_REVISION
 
 
-def test_the_gallery_is_listed(client):
+def test_all_gallery_cases_are_listed(client):
     cases = client.get("/v1/gallery").json()["cases"]
     assert [case["name"] for case in cases] == list(GALLERY)
     assert cases[0] == {
@@ -112,7 +112,7 @@ def test_the_gallery_is_listed(client):
     }  # fmt: skip
 
 
-def test_each_case_of_the_gallery_has_a_picture(client):
+def test_each_gallery_case_has_a_picture(client):
     cases = client.get("/v1/gallery").json()["cases"]
     pictures = [client.get(case["picture"]) for case in cases]
     assert {answer.headers["Content-Type"] for answer in pictures} == {"image/svg+xml"}

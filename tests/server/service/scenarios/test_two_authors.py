@@ -1,4 +1,4 @@
-"""Two clients edit one scenario, each with the revision it knows."""
+"""Two clients edit one scenario concurrently, each with its last known revision."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ TURNS = st.lists(st.tuples(st.sampled_from(NAMES), MOVES), min_size=1, max_size=
 
 @dataclass
 class Author:
-    """A client that keeps a scenario of its own and moves it only by what it is told."""
+    """A client that updates its local copy only from server answers."""
 
     http: Any
     url: str
@@ -38,7 +38,7 @@ class Author:
     own: Scenario
 
     def act(self, move: list[dict[str, Any]] | str) -> int | None:
-        """Revision that the server acknowledged; None where it refused."""
+        """The acknowledged revision, or None if the server refused."""
         call = "operations" if isinstance(move, list) else move
         answer = self.http.post(
             f"{self.url}/{call}",
@@ -53,7 +53,7 @@ class Author:
             return None
         entry = {"revision": self.own.revision + 1} | self._kind(move)
         if answer.status_code != 200:
-            # Nothing was missed, so that the author must be able to see the reason itself.
+            # Nothing was missed, so the author can derive the reason from its own state.
             with pytest.raises(EditError) as seen:
                 self._planned(HistoryEntry(created_at="", **entry))
             assert answer.json()["code"] == seen.value.code
@@ -92,7 +92,7 @@ class Author:
     max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(turns=TURNS)
-def test_any_interleaving_ends_in_a_state_that_both_authors_can_explain(client, turns):
+def test_any_interleaving_leads_both_authors_to_the_server_state(client, turns):
     url = client.post("/v1/scenarios", json={"scene": "tiny"}).headers["Location"]
     view = client.portal.call(client.app.state.worker.scenarios.view, url.rsplit("/", 1)[-1])
     initial = ScenarioState.of(view.summary)
@@ -118,7 +118,7 @@ def test_any_interleaving_ends_in_a_state_that_both_authors_can_explain(client, 
 
 
 def _as_service_error(view: ScenarioView, scenario: Scenario) -> dict[str, Any]:
-    """What the server would say of a scenario like this one."""
+    """The server's description of this scenario."""
     shown = ScenarioView(
         row=view.row,
         summary=view.summary,

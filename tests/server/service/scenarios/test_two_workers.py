@@ -1,4 +1,4 @@
-"""Two workers on one database: what one has acknowledged, the other shows."""
+"""Two workers on one database. An edit acknowledged by one is visible at the other."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def edit(worker, url, *operations, **headers):
     return worker.post(f"{url}/operations", json=body, headers=headers)
 
 
-def test_an_acknowledged_edit_is_seen_by_every_worker_at_once(workers, scenario):
+def test_an_acknowledged_edit_is_visible_on_every_worker_at_once(workers, scenario):
     for n in range(6):
         writer, reader = workers[n % 2], workers[1 - n % 2]
         assert edit(writer, scenario, MOVE).json()["revision"] == n + 1
@@ -73,14 +73,14 @@ def test_an_acknowledged_edit_is_seen_by_every_worker_at_once(workers, scenario)
         assert len(reader.get(f"{scenario}/operations").json()["entries"]) == n + 1
 
 
-def test_undo_takes_back_what_the_other_worker_did(workers, scenario):
+def test_undo_reverts_an_edit_of_the_other_worker(workers, scenario):
     assert edit(workers[0], scenario, DELETE).status_code == 200
     assert workers[1].post(f"{scenario}/undo").json()["revision"] == 2
     shown = [o["object_id"] for o in workers[0].get(scenario).json()["objects"]]
     assert "car_red" in shown
 
 
-def test_a_session_begins_from_what_the_other_worker_has_edited(workers, scenario):
+def test_a_session_starts_from_the_edits_of_the_other_worker(workers, scenario):
     assert edit(workers[0], scenario, DELETE).status_code == 200
     made = workers[1].post("/v1/sessions", params={"scenario": scenario.split("/")[-1]}, json={})
     headers = {"Authorization": f"Bearer {made.json()['token']}"}
@@ -88,7 +88,7 @@ def test_a_session_begins_from_what_the_other_worker_has_edited(workers, scenari
     assert "car_red" not in [a["object_id"] for a in state.json()["agents"]]
 
 
-def test_a_stale_edit_is_told_what_the_other_worker_did(workers, scenario):
+def test_a_stale_edit_is_refused_with_the_edits_of_the_other_worker(workers, scenario):
     assert edit(workers[0], scenario, DELETE).status_code == 200
     refused = edit(workers[1], scenario, MOVE, **{"If-Match": '"r0"'})
     assert refused.status_code == 412
@@ -102,7 +102,7 @@ def test_a_scenario_that_the_other_worker_has_deleted_is_gone(workers, scenario)
 
 
 def looking_too_early(worker, monkeypatch) -> None:
-    """The worker's next look for an answer happens before the other worker has stored it."""
+    """Make the worker look for a stored answer before the other worker has stored it."""
     store = worker.app.state.worker.store
     given, looks = store.reply, []
 
@@ -123,7 +123,7 @@ def looking_too_early(worker, monkeypatch) -> None:
     ],
     ids=["edit", "scenario", "session", "job"],
 )
-def test_a_request_sent_to_both_workers_at_once_takes_effect_once(
+def test_a_request_sent_to_both_workers_takes_effect_once(
     workers, scenario, monkeypatch, path, body
 ):
     path, key = path.format(scenario=scenario), {"Idempotency-Key": scenario}
@@ -137,12 +137,12 @@ def test_a_request_sent_to_both_workers_at_once_takes_effect_once(
 
 
 def all_there_is(worker, scenario) -> tuple[int, ...]:
-    """Revisions of the scenario; numbers of scenarios, sessions and jobs of a worker."""
+    """Revisions of the scenario, and the number of scenarios, sessions and jobs of a worker."""
     lists = (worker.get(f"/v1/{name}").json()[name] for name in ("scenarios", "sessions", "jobs"))
     return worker.get(scenario).json()["revision"], *map(len, lists)
 
 
-def test_edits_at_both_workers_at_once_are_all_kept_in_one_order(workers, scenario):
+def test_concurrent_edits_on_both_workers_are_all_kept_in_one_order(workers, scenario):
     answers: list[list[int]] = [[], []]
 
     def author(n: int) -> None:
@@ -160,7 +160,7 @@ def test_edits_at_both_workers_at_once_are_all_kept_in_one_order(workers, scenar
     assert [worker.get(scenario).json()["revision"] for worker in workers] == [16, 16]
 
 
-def test_another_name_is_seen_by_every_worker_at_once(workers, scenario):
+def test_a_rename_is_visible_on_every_worker_at_once(workers, scenario):
     assert workers[0].patch(scenario, json={"name": "in the rain"}).json()["name"] == "in the rain"
     assert workers[1].get(scenario).json()["name"] == "in the rain"
     assert workers[1].patch(scenario, json={"name": ""}).status_code == 422

@@ -1,4 +1,4 @@
-"""A worker on a real socket, and clients that speak to it message by message."""
+"""A worker on a real socket, and clients that exchange messages with it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ CONTROL = {"kind": "control", "acceleration": 0.5, "steering": 0.02}
 
 
 class Planner:
-    """One end of a drive socket."""
+    """A client of a drive socket."""
 
     def __init__(self, info: dict[str, Any], *, max_queue: int = 16) -> None:
         self.info = info
@@ -51,7 +51,7 @@ class Planner:
         return self.ids
 
     def receive(self) -> dict[str, Any]:
-        """The next message that is not about progress."""
+        """The next message, skipping progress messages."""
         while True:
             message = decode(self.socket.recv(timeout=120, decode=False))
             if message["type"] != "progress":
@@ -74,7 +74,7 @@ class Planner:
         return self.ask("action", step=step, plan=CONTROL | plan)
 
     def wait_closed(self) -> int | None:
-        """Close code, once the worker has closed; what it sent before is thrown away."""
+        """Close code sent by the worker. Discards earlier messages."""
         with contextlib.suppress(ConnectionClosed):
             while True:
                 self.socket.recv(timeout=120)
@@ -106,7 +106,7 @@ class Site:
         return self.http.request(method, path, headers=headers, **options)
 
     def session(self, info: dict[str, Any]) -> Session:
-        """The session, from inside."""
+        """The worker's session object."""
         (found,) = (s for s in self.worker.sessions if s.session_id == info["session_id"])
         return found
 
@@ -118,7 +118,7 @@ class Site:
 
 @pytest.fixture(scope="package")
 def own_site(tmp_path_factory, tiny_scene) -> Iterator[Callable[..., Site]]:
-    """Starts workers that hold ``tiny``; keywords are settings."""
+    """Start workers with the scene ``tiny``. Keyword arguments are settings."""
     with ExitStack() as stack:
 
         def start(**overrides: Any) -> Site:
@@ -141,7 +141,7 @@ def shared_site(own_site) -> Site:
 
 @pytest.fixture
 def site(shared_site: Site) -> Iterator[Site]:
-    """A worker that all tests here share, without sessions at the start of each."""
+    """A worker shared by all tests here, without sessions at the start of each test."""
     yield shared_site
     shared_site.clear()
     assert len(shared_site.worker.sessions) == 0
@@ -149,7 +149,7 @@ def site(shared_site: Site) -> Iterator[Site]:
 
 @pytest.fixture
 def join() -> Iterator[Callable[..., Planner]]:
-    """Connects to a session; says hello in a role unless that is None."""
+    """Connect to a session and say hello in a role, unless ``role`` is None."""
     with ExitStack() as stack:
 
         def connected(
@@ -171,7 +171,7 @@ def planner(site: Site, join) -> Planner:
 
 @pytest.fixture
 def bystander(site: Site, join) -> Iterator[Planner]:
-    """Another session; after the test it must still drive."""
+    """Another session, which must still be drivable after the test."""
     planner = join(site.create())
     planner.reset(sensors=[{"camera": "front"}])
     yield planner

@@ -1,4 +1,4 @@
-"""Actions of a controller: each read once, answered in order, counted, and seen by all."""
+"""Controller actions are decoded once, answered in order, counted, and visible to observers."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ CAMERA = {"camera": "front", "width": 160, "codec": "raw"}
 
 
 @pytest.mark.parametrize("sensors", [[], [CAMERA]])
-def test_an_action_of_the_sdk_on_the_same_machine_is_decoded_once(site, monkeypatch, sensors):
+def test_an_sdk_action_over_shared_memory_is_decoded_once(site, monkeypatch, sensors):
     decoded = []
     for name in ("unpack", "decode"):
         read = getattr(messages, name)
@@ -36,7 +36,7 @@ def test_an_action_of_the_sdk_on_the_same_machine_is_decoded_once(site, monkeypa
         assert len(decoded) - before == 3
 
 
-def test_messages_sent_ahead_are_answered_in_order(site, planner):
+def test_pipelined_messages_are_answered_in_order(site, planner):
     planner.reset(sensors=[])
     ids = [planner.send("action", step=step, plan=CONTROL) for step in range(3)]
     ids.append(planner.send("snapshot", name="here"))
@@ -45,7 +45,7 @@ def test_messages_sent_ahead_are_answered_in_order(site, planner):
     assert [a["step"] for a in answers] == [1, 2, 3, 3]
 
 
-def test_a_refused_plan_leaves_the_action_due(site, join):
+def test_a_refused_plan_does_not_advance_the_step(site, join):
     info = site.create()
     planner = join(info)
     planner.reset(sensors=[])
@@ -57,7 +57,7 @@ def test_a_refused_plan_leaves_the_action_due(site, join):
     assert planner.act(0)["step"] == 1
 
 
-def test_messages_are_counted(site, planner):
+def test_messages_count_as_requests_of_the_account(site, planner):
     account: Account = site.worker.accounts.default
     planner.reset(sensors=[])
     before = account.requests
@@ -65,7 +65,7 @@ def test_messages_are_counted(site, planner):
     assert account.requests == before + 1
 
 
-def test_an_observer_and_the_present_state_see_the_step(site, join):
+def test_observers_and_the_state_route_see_the_step(site, join):
     info = site.create()
     planner, observer = join(info), join(info, "observer")
     planner.reset(sensors=[])

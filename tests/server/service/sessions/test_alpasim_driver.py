@@ -1,7 +1,7 @@
-"""NVIDIA's own driver service drives: served out of a checkout of NVlabs/alpasim, where one is.
+"""NVIDIA's AlpaSim driver service drives a session.
 
-REAL2SIM_ALPASIM names the checkout (github.com/NVlabs/alpasim, Apache-2.0). Its service also needs
-grpcio-tools, omegaconf, hydra-core and torch, but no weights: the model is a stub of ours.
+REAL2SIM_ALPASIM names a checkout of github.com/NVlabs/alpasim (Apache-2.0). The service also needs
+grpcio-tools, omegaconf, hydra-core and torch, but no weights: the model is a stub.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ CAMERAS = ["camera_front_wide_120fov", "camera_front_tele_30fov", "camera_cross_
 
 @pytest.fixture
 def serve(tmp_path):
-    """Starts the service for cameras and a context; its address."""
+    """Start the service for some cameras and a context length. Returns its address."""
     checkout = os.environ.get("REAL2SIM_ALPASIM")
     if not checkout:
         pytest.skip("REAL2SIM_ALPASIM names no checkout of NVlabs/alpasim")
@@ -58,7 +58,7 @@ def serve(tmp_path):
 
 
 def drive(site, target: str, *, steps: int) -> tuple[real2sim.planners.EpisodeSummary, int]:
-    """A drive of the tiny scene, which lasts two seconds."""
+    """Drive the tiny scene, which lasts two seconds."""
     planner = AlpasimDriver(target)
     with real2sim.connect(site.url) as client, client.session(scene="tiny") as session:
         sensors = planner.needs.sensors(session.welcome.cameras)
@@ -75,10 +75,10 @@ def test_nvidias_service_drives_100_steps(site, serve, context, count):
     summary, sensors = drive(site, serve(CAMERAS[:count], context), steps=100)
     assert summary.steps == 100
     assert summary.distance > 5.0
-    # The scene has two cameras, and the front one serves for wide and tele.
+    # The scene has two cameras. The front one serves as both wide and tele.
     assert sensors == (1 if count < 3 else 2)
 
 
-def test_a_service_that_rectifies_drives(site, serve):
+def test_a_service_with_rectification_drives(site, serve):
     summary, _ = drive(site, serve(CAMERAS[:1], 1, "rectify"), steps=10)
     assert summary.steps == 10

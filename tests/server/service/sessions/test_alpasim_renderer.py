@@ -1,7 +1,7 @@
-"""A worker's pictures behind AlpaSim's SensorsimService, asked for as AlpaSim's runtime does.
+"""The AlpaSim SensorsimService of a worker, called as AlpaSim's runtime does.
 
-With REAL2SIM_ALPASIM naming a checkout of NVlabs/alpasim, the messages and stubs are those that its
-own protos compile to (which needs grpcio-tools); the same calls run by this repository's messages.
+If REAL2SIM_ALPASIM names a checkout of NVlabs/alpasim, messages and stubs are compiled from its
+protos (needs grpcio-tools). The same calls also run with this repository's messages.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ pytestmark = pytest.mark.network
 
 PNG, JPEG, PLANAR, AV1 = 1, 2, 4, 6
 SHIFTED = np.array([[0.0, -1, 0, 5], [1, 0, 0, -3], [0, 0, 1, 2], [0, 0, 0, 1]])
-"""T_world_theirs of a scene whose other simulator counts in another world."""
+"""T_world_theirs of a scene for which the other simulator uses a different world frame."""
 LATER = 1_700_000_000_000_000
 
 
@@ -76,7 +76,7 @@ def their_side(channel, folder: Path):
         pytest.skip("REAL2SIM_ALPASIM names no checkout of NVlabs/alpasim")
     protoc = pytest.importorskip("grpc_tools.protoc")
     source = Path(checkout) / "src/grpc"
-    # The package's own __init__ asks what version of it is installed.
+    # The package's own __init__ looks up its installed version.
     (folder / "alpasim_grpc/v0").mkdir(parents=True, exist_ok=True)
     for proto in ("common", "sensorsim"):
         path = source / f"alpasim_grpc/v0/{proto}.proto"
@@ -99,7 +99,7 @@ def compiled(tmp_path_factory):
 
 @pytest.fixture(params=["our messages", "their protos"])
 def runtime(request, renderer, compiled):
-    """Messages and stub on AlpaSim's side."""
+    """Messages and stub on the AlpaSim side."""
     with grpc.insecure_channel(renderer.target) as channel:
         if request.param == "our messages":
             yield our_side(channel)
@@ -132,7 +132,7 @@ def pair(m, matrix):
 
 
 def asked(m, stub, *, scene="clip", camera="front", rig=None, t_us=0, objects=(), **fields):
-    """A request as AlpaSim's runtime makes it out of the cameras that the renderer has."""
+    """A request as AlpaSim's runtime builds it from the available cameras."""
     available = stub.get_available_cameras(m.AvailableCamerasRequest(scene_id=scene))
     (found,) = [c for c in available.available_cameras if c.logical_id == camera]
     rig = np.eye(4) if rig is None else rig
@@ -174,7 +174,7 @@ def as_recorded(scene, t_us, *, but=()):
     return [(o.object_id, o.trajectory.transform(t_us)) for o in moving]
 
 
-def test_a_rollout_shows_what_the_worker_draws(site, runtime, tiny_scene):
+def test_a_rollout_frame_equals_the_worker_render(site, runtime, tiny_scene):
     m, stub = runtime
     for t_us in (0, 1_000_000):
         rig = tiny_scene.ego.transform(t_us)
@@ -182,11 +182,11 @@ def test_a_rollout_shows_what_the_worker_draws(site, runtime, tiny_scene):
         with real2sim.connect(site.url) as client:
             drawn = client.scenes.render("tiny", camera="front", t_us=t_us, codec="raw").array
         difference = np.abs(pixels(stub.render_rgb(request)).astype(int) - drawn)
-        # Their numbers are single precision.
+        # AlpaSim sends single-precision numbers.
         assert difference.mean() < 0.2
 
 
-def test_an_object_is_where_the_runtime_has_it(runtime, tiny_scene):
+def test_an_object_is_rendered_at_the_pose_of_the_runtime(runtime, tiny_scene):
     m, stub = runtime
     there = placed(12.0, 0.0, 0.75)
     before = pixels(stub.render_rgb(asked(m, stub)))
@@ -200,7 +200,7 @@ def test_an_object_is_where_the_runtime_has_it(runtime, tiny_scene):
     assert red - green < 30
 
 
-def test_a_batch_has_every_camera(runtime):
+def test_a_batch_returns_one_image_per_camera(runtime):
     m, stub = runtime
     items = [
         m.BatchRGBRenderRequestItem(camera_name=name, request=asked(m, stub, camera=name))
@@ -212,7 +212,7 @@ def test_a_batch_has_every_camera(runtime):
     assert answer.items[1].result.image_bytes == alone.image_bytes
 
 
-def test_one_item_that_cannot_be_drawn_leaves_the_others(ours):
+def test_a_failed_batch_item_does_not_affect_the_others(ours):
     m, stub = ours
     good, bad = asked(m, stub), asked(m, stub, image_format=AV1)
     items = [
@@ -224,14 +224,14 @@ def test_one_item_that_cannot_be_drawn_leaves_the_others(ours):
     assert first.error_message.startswith("UNIMPLEMENTED: image format 6")
 
 
-def test_an_aggregate_has_every_image(runtime):
+def test_an_aggregated_request_returns_every_image(runtime):
     m, stub = runtime
     requests = [asked(m, stub, t_us=t_us) for t_us in (0, 100_000)]
     answer = stub.render_aggregated(m.AggregatedRenderRequest(rgb_requests=requests))
     assert len(answer.rgb_returns) == 2
 
 
-def test_rollouts_at_once_get_their_own_pictures(ours):
+def test_concurrent_rollouts_get_their_own_images(ours):
     m, stub = ours
     requests = [
         asked(m, stub, objects=[("car_red", placed(10.0 + 2 * k, 1.0, 0.75))]) for k in range(4)
@@ -243,7 +243,7 @@ def test_rollouts_at_once_get_their_own_pictures(ours):
         assert list(together) == alone * 3
 
 
-def test_scenes_are_listed_and_those_in_memory_told(runtime):
+def test_available_and_loaded_scenes_are_listed(runtime):
     m, stub = runtime
     assert list(stub.get_available_scenes(m.Empty()).scene_ids) == ["clip", "elsewhere"]
     stub.render_rgb(asked(m, stub))
@@ -257,7 +257,7 @@ def test_scenes_are_listed_and_those_in_memory_told(runtime):
     assert not stub.get_available_ego_masks(m.Empty()).ByteSize()
 
 
-def test_cameras_have_alpasims_names_where_they_look_that_way(ours, tiny_scene):
+def test_cameras_get_alpasim_names_by_viewing_direction(ours, tiny_scene):
     m, stub = ours
     available = stub.get_available_cameras(m.AvailableCamerasRequest(scene_id="clip"))
     cameras = {c.logical_id: c for c in available.available_cameras}
@@ -265,13 +265,13 @@ def test_cameras_have_alpasims_names_where_they_look_that_way(ours, tiny_scene):
     assert "camera_cross_right_120fov" not in cameras
     left = matrix_of(cameras["camera_cross_left_120fov"].rig_to_camera)
     np.testing.assert_allclose(left, tiny_scene.rig["left"].T_vehicle_camera, atol=1e-6)
-    # The narrow one is drawn as narrow as it is called.
+    # The tele camera has the field of view in its name.
     spec = cameras["camera_front_tele_30fov"].intrinsics
     focal = spec.opencv_pinhole_param.focal_length_x
     assert 2 * np.arctan(spec.resolution_w / 2 / focal) == pytest.approx(np.radians(30))
 
 
-def test_another_world_clock_and_names_are_translated(ours, tiny_scene):
+def test_world_frame_clock_and_object_names_are_converted(ours, tiny_scene):
     m, stub = ours
     theirs = invert_transform(SHIFTED)
     same = {"resolution_h": 64}
@@ -298,14 +298,14 @@ def test_another_world_clock_and_names_are_translated(ours, tiny_scene):
     np.testing.assert_allclose(matrix_of(last.pose), expected, atol=1e-5)
 
 
-def test_forms_and_sizes_of_images(ours):
+def test_image_formats_and_sizes(ours):
     m, stub = ours
     jpeg = stub.render_rgb(asked(m, stub, image_format=JPEG)).image_bytes
     assert simplejpeg.decode_jpeg(jpeg).shape == (64, 96, 3)
     planar = stub.render_rgb(asked(m, stub, image_format=PLANAR)).image_bytes
     image = np.frombuffer(planar, np.uint8).reshape(3, 64, 96).transpose(1, 2, 0)
     assert np.array_equal(image, pixels(stub.render_rgb(asked(m, stub))))
-    # Like AlpaSim's own renderer: the height is what is asked for, and the shape is kept.
+    # Like AlpaSim's own renderer: use the requested height and keep the aspect ratio.
     half = stub.render_rgb(asked(m, stub, resolution_h=32, resolution_w=100))
     assert pixels(half).shape == (32, 48, 3)
 
@@ -344,7 +344,7 @@ def unsupported(m, request, change: str):
         ("scene", "NOT_FOUND", "no scene 'nowhere'; there are clip, elsewhere"),
     ],
 )
-def test_what_is_not_drawn_is_said_by_status(ours, change, status, said):
+def test_unsupported_requests_return_a_grpc_status(ours, change, status, said):
     m, stub = ours
     with pytest.raises(grpc.RpcError) as refused:
         stub.render_rgb(unsupported(m, asked(m, stub), change))
@@ -352,7 +352,7 @@ def test_what_is_not_drawn_is_said_by_status(ours, change, status, said):
     assert said in refused.value.details()
 
 
-def test_lidars_are_not_drawn(ours):
+def test_lidar_requests_are_unimplemented(ours):
     m, stub = ours
     for call in (
         lambda: stub.render_lidar(m.LidarRenderRequest()),
@@ -365,7 +365,7 @@ def test_lidars_are_not_drawn(ours):
         assert refused.value.code() is grpc.StatusCode.UNIMPLEMENTED
 
 
-def test_objects_that_the_scene_lacks_are_left_out_or_refused(renderer, ours):
+def test_unknown_objects_are_ignored_or_refused_in_strict_mode(renderer, ours):
     m, stub = ours
     request = asked(m, stub, objects=[("ghost", placed(8, 0, 1))])
     assert stub.render_rgb(request).image_bytes == stub.render_rgb(asked(m, stub)).image_bytes
@@ -375,7 +375,7 @@ def test_objects_that_the_scene_lacks_are_left_out_or_refused(renderer, ours):
     assert "has no object 'ghost'; it has car_red" in refused.value.details()
 
 
-def test_a_worker_that_is_gone_is_unavailable(own_site):
+def test_a_stopped_worker_is_reported_as_unavailable(own_site):
     lone = own_site()
     with real2sim.connect(lone.url, retries=0) as client:
         served = AlpasimRenderer(client)

@@ -1,4 +1,4 @@
-"""Clients that break the rules are told so, and nobody else notices."""
+"""Clients that violate the protocol get an error and do not affect other sessions."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ def refused_handshake(url: str, subprotocols: list[str] | None) -> tuple[int, di
     return response.status_code, json.loads(response.body)
 
 
-# --- at the door ------------------------------------------------------------------------------
+# --- handshake ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("offered", [["real2sim.v9.msgpack"], ["chat", "soap"], None])
-def test_other_protocols_are_refused_at_the_handshake_with_both_versions(site, offered):
+def test_an_unsupported_subprotocol_is_refused_with_both_names(site, offered):
     status, problem = refused_handshake(site.create()["ws_url"], offered)
     assert (status, problem["code"]) == (426, "UNSUPPORTED_PROTOCOL")
     assert DRIVE_SUBPROTOCOL in problem["detail"]
@@ -54,7 +54,7 @@ def test_a_closed_session_is_refused_at_the_handshake(site):
     assert (status, problem["code"]) == (410, "SESSION_CLOSED")
 
 
-# --- greeting ---------------------------------------------------------------------------------
+# --- hello --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -68,14 +68,14 @@ def test_a_closed_session_is_refused_at_the_handshake(site):
         ({"protocols": []}, "BAD_MESSAGE"),
     ],
 )
-def test_a_hello_that_is_wrong_ends_the_connection(site, join, fields, code):
+def test_an_invalid_hello_closes_the_connection(site, join, fields, code):
     planner = join(site.create(), None)
     answer = planner.hello(**fields)
     assert (answer["type"], answer["code"], answer["fatal"]) == ("error", code, True)
     assert planner.wait_closed() == 1008
 
 
-def test_both_versions_are_named_when_they_differ(site, join):
+def test_a_version_mismatch_names_both_versions(site, join):
     detail = join(site.create(), None).hello(v=2)["detail"]
     assert "version 2" in detail
     assert "speaks 1" in detail
@@ -87,12 +87,12 @@ def test_the_first_message_must_be_hello(site, join):
     assert (answer["code"], answer["fatal"]) == ("BAD_MESSAGE", True)
 
 
-def test_a_second_hello_is_refused_and_harmless(planner):
+def test_a_second_hello_is_refused_without_side_effects(planner):
     assert planner.hello()["code"] == "BAD_MESSAGE"
     assert planner.reset()["step"] == 0
 
 
-def test_a_second_controller_is_refused_and_the_first_undisturbed(site, join):
+def test_a_second_controller_is_refused_without_affecting_the_first(site, join):
     info = site.create()
     first = join(info)
     first.reset()
@@ -121,7 +121,7 @@ def test_a_second_controller_is_refused_and_the_first_undisturbed(site, join):
         ("straight on", "plan"),
     ],
 )
-def test_a_plan_that_makes_no_sense_is_explained_and_moves_nothing(planner, bystander, plan, told):
+def test_an_invalid_plan_is_explained_and_does_not_advance_the_step(planner, bystander, plan, told):
     planner.reset()
     answer = planner.ask("action", step=0, plan=plan)
     assert (answer["type"], answer["code"], answer["fatal"]) == ("error", "BAD_MESSAGE", False)
@@ -145,7 +145,7 @@ def test_a_plan_that_makes_no_sense_is_explained_and_moves_nothing(planner, byst
         "a string",
     ],
 )
-def test_whatever_is_no_message_is_refused_and_the_session_goes_on(planner, data):
+def test_a_malformed_message_is_refused_and_the_session_continues(planner, data):
     planner.reset()
     planner.socket.send(data)
     answer = planner.receive()
@@ -154,7 +154,9 @@ def test_whatever_is_no_message_is_refused_and_the_session_goes_on(planner, data
     assert planner.act(0)["step"] == 1
 
 
-def test_a_message_of_another_version_ends_the_connection_but_not_the_session(site, join, planner):
+def test_a_message_of_another_version_closes_the_connection_but_not_the_session(
+    site, join, planner
+):
     planner.reset()
     answer = planner.ask("action", v=3, step=0, plan={})
     assert (answer["code"], answer["fatal"]) == ("UNSUPPORTED_PROTOCOL", True)
@@ -162,14 +164,14 @@ def test_a_message_of_another_version_ends_the_connection_but_not_the_session(si
     assert join(planner.info).act(0)["step"] == 1
 
 
-def test_an_oversized_message_closes_its_connection_only(site, join, planner, bystander):
+def test_an_oversized_message_closes_only_its_connection(site, join, planner, bystander):
     planner.reset()
     planner.socket.send(b"x" * (MAX_CLIENT_MESSAGE_BYTES + 1))
     assert planner.wait_closed() == 1009
     assert join(planner.info).act(0)["step"] == 1
 
 
-def test_the_largest_message_allowed_is_read_beside_the_event_loop(planner, bystander):
+def test_a_plan_near_the_message_size_limit_is_parsed_and_refused(planner, bystander):
     planner.reset()
     poses = [[0.0, 0.0, 0.0]] * 30_000
     answer = planner.ask(
@@ -179,17 +181,17 @@ def test_the_largest_message_allowed_is_read_beside_the_event_loop(planner, byst
     assert "at most 1024" in answer["detail"]
 
 
-# --- clients that vanish ----------------------------------------------------------------------
+# --- clients that disconnect --------------------------------------------------------------------
 
 
 def vanish(planner) -> None:
-    """Drop the connection without a word, as a process that is killed does."""
+    """Drop the connection without a close frame, like a killed process."""
     raw = planner.socket.socket
     raw.setsockopt(sockets.SOL_SOCKET, sockets.SO_LINGER, b"\x01\x00\x00\x00\x00\x00\x00\x00")
     raw.close()
 
 
-def test_a_client_that_vanishes_mid_step_leaves_the_session_to_the_next(site, join, bystander):
+def test_a_new_controller_continues_after_a_disconnect_during_a_step(site, join, bystander):
     info = site.create()
     planner = join(info)
     planner.reset(sensors=[CAMERA | {"width": 2048}])
@@ -202,7 +204,7 @@ def test_a_client_that_vanishes_mid_step_leaves_the_session_to_the_next(site, jo
     assert successor.act(1)["step"] == 2
 
 
-def test_an_observer_that_vanishes_is_forgotten(site, join):
+def test_a_disconnected_observer_is_removed(site, join):
     info = site.create()
     controller, observer = join(info), join(info, "observer")
     controller.reset()
@@ -213,7 +215,7 @@ def test_an_observer_that_vanishes_is_forgotten(site, join):
     wait_until(lambda: not session.observers, "the worker to notice")
 
 
-def test_deleting_a_session_tells_all_who_are_connected(site, join):
+def test_deleting_a_session_notifies_all_clients(site, join):
     info = site.create()
     connected = [join(info), join(info, "observer")]
     connected[0].reset()

@@ -1,4 +1,4 @@
-"""LiDARs and radars of a session."""
+"""LiDAR and radar sensors of a session."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ EPISODE = {"dt_us": 50_000, "lidars": [TOP], "radars": [{"radar": "corner"}]}
 
 @pytest.fixture(autouse=True, scope="module")
 def casting_kernels():
-    """On disk, so that no reset waits for them."""
+    """Cache the kernels on disk, so that no reset waits for them."""
     warm_up_casting()
 
 
 def columns(cloud):
-    """The columns of a raw cloud."""
+    """Columns of a raw cloud."""
     found, begin = {}, 0
     for field in cloud["fields"]:
         dtype = np.dtype(field["dtype"])
@@ -55,7 +55,7 @@ def test_a_slower_lidar_is_delivered_when_its_sweep_is_complete(planner):
     assert -100_000 <= times.min() < times.max() <= 0
 
 
-def test_points_lie_where_their_pose_says(planner):
+def test_points_match_the_objects_at_the_sensor_pose(planner):
     obs = planner.reset(**EPISODE, privileged=True)
     cloud = obs["clouds"][0]
     found = columns(cloud)
@@ -80,12 +80,12 @@ def test_the_same_episode_gives_the_same_clouds(site, join):
     assert other != drives[0][0]
 
 
-def test_messages_of_episodes_without_them_have_no_clouds(planner):
+def test_observations_without_lidars_or_radars_have_no_clouds(planner):
     assert "clouds" not in planner.reset(dt_us=50_000)
     assert "clouds" not in planner.act(0)
 
 
-def test_deflated_columns_are_those_that_raw_ones_are(planner):
+def test_deflated_columns_equal_raw_columns(planner):
     raw = planner.reset(**EPISODE)["clouds"][0]
     packed = planner.reset(dt_us=50_000, lidars=[TOP | {"codec": "deflate"}])["clouds"][0]
     data = zlib.decompress(packed["data"])
@@ -98,7 +98,7 @@ def test_deflated_columns_are_those_that_raw_ones_are(planner):
         begin += size
 
 
-def test_a_look_aside_moves_nothing(site, planner):
+def test_rendering_a_cloud_does_not_advance_time(site, planner):
     obs = planner.reset(dt_us=50_000)
     view = planner.ask("render", lidars=[TOP | {"fields": ["ring"]}], radars=[])
     assert [field["name"] for field in view["clouds"][0]["fields"]] == ["points", "ring"]
@@ -109,7 +109,7 @@ def test_a_look_aside_moves_nothing(site, planner):
     assert planner.act(0)["step"] == obs["step"] + 1
 
 
-def test_rest_says_which_models_there_are(site):
+def test_rest_lists_the_lidar_and_radar_models(site):
     about = site.http.get("/v1/server").json()
     assert "os1-128" in about["lidar_models"]
     assert "corner" in about["radar_models"]
@@ -131,7 +131,7 @@ TABLE = {"kind": "table", "azimuth_deg": [0.0], "elevation_deg": [0.0], "time_us
         ({"lidar": "corner", "model": FAN}, "one name"),
     ],
 )
-def test_what_cannot_be_is_refused_with_the_reason(planner, lidar, said):
+def test_an_invalid_sensor_is_refused_with_the_reason(planner, lidar, said):
     radars = [{"radar": "corner"}]
     error = planner.reset(dt_us=50_000, lidars=[lidar], radars=radars)
     assert (error["type"], error["code"]) == ("error", "INVALID_REQUEST")
@@ -139,21 +139,21 @@ def test_what_cannot_be_is_refused_with_the_reason(planner, lidar, said):
     assert planner.reset()["step"] == 0
 
 
-def test_tables_with_numbers_that_are_none_are_refused(planner):
+def test_non_finite_beam_tables_are_refused(planner):
     model = FAN | {"beams": TABLE | {"time_us": [float("nan")]}}
     error = planner.reset(lidars=[{"lidar": "top", "model": model}])
     assert error["code"] == "BAD_MESSAGE"
     assert "finite" in error["detail"]
 
 
-def test_more_rays_than_a_worker_allows_are_refused(planner):
+def test_rays_over_the_limit_of_the_worker_are_refused(planner):
     lidars = [{"lidar": f"top{k}", "model": "os1-128"} for k in range(5)]
     error = planner.reset(lidars=lidars)
     assert error["code"] == "INVALID_REQUEST"
     assert "655,360 rays in one go; this worker allows 524,288" in error["detail"]
 
 
-def test_snapshots_bring_back_the_sweep(planner):
+def test_restoring_a_snapshot_restores_the_sweep(planner):
     planner.reset(**EPISODE)
     planner.act(0)
     there = planner.act(1)
@@ -163,7 +163,7 @@ def test_snapshots_bring_back_the_sweep(planner):
     assert [c["data"] for c in again["clouds"]] == [c["data"] for c in there["clouds"]]
 
 
-def test_a_session_that_is_rebuilt_goes_on_with_the_same_sweep(site, join):
+def test_a_rebuilt_session_continues_with_the_same_sweep(site, join):
     whole = join(site.create())
     whole.reset(**EPISODE)
     expected = [whole.act(step) for step in range(4)][-1]["clouds"]
@@ -180,7 +180,7 @@ def test_a_session_that_is_rebuilt_goes_on_with_the_same_sweep(site, join):
     assert [c["data"] for c in again.act(3)["clouds"]] == [c["data"] for c in expected]
 
 
-def test_recordings_keep_clouds_beside_images(site, tmp_path):
+def test_recordings_store_clouds(site, tmp_path):
     with real2sim.connect(site.url) as client, client.session(scene="tiny") as session:
         session.reset(dt_us=50_000, action="control", lidars=[TOP])
         for _ in range(2):
@@ -192,7 +192,7 @@ def test_recordings_keep_clouds_beside_images(site, tmp_path):
     np.testing.assert_array_equal(found["points"], obs.lidar("top").points)
 
 
-def test_clouds_of_the_sdk_go_to_files_and_to_the_world(site, tmp_path):
+def test_sdk_clouds_are_saved_and_converted_to_world_coordinates(site, tmp_path):
     with real2sim.connect(site.url) as client, client.session(scene="tiny") as session:
         deflated = TOP | {"codec": "deflate", "frame": "vehicle"}
         session.reset(dt_us=50_000, lidars=[TOP], privileged=True)
@@ -206,7 +206,7 @@ def test_clouds_of_the_sdk_go_to_files_and_to_the_world(site, tmp_path):
         view.radar("top")
 
 
-def test_semantic_images_tell_the_ground(planner):
+def test_semantic_images_label_the_ground(planner):
     sensors = [{"camera": "front", "modalities": ["semantic", "instance"], "detail": "full"}]
     frames = planner.reset(sensors=sensors)["frames"]
     semantic = np.frombuffer(frames[0]["data"], np.uint8)
@@ -215,7 +215,7 @@ def test_semantic_images_tell_the_ground(planner):
     assert not (semantic[instance > 0] == 6).any()
 
 
-def test_a_scenario_is_swept_from_the_recording_vehicle(site):
+def test_a_scenario_is_scanned_from_the_recording_vehicle(site):
     made = site.http.post("/v1/scenarios", json={"scene": "tiny"}).json()
     path = f"/v1/scenarios/{made['scenario_id']}/sweep"
     points = site.http.get(

@@ -1,6 +1,6 @@
-"""Planners that misbehave: each case ends as the rules say, and nobody else waits for it.
+"""Planners that miss deadlines or send invalid answers. No other session is affected.
 
-Time stands still but where a test moves it, so no planner here is late by accident.
+Time only advances when a test moves it, so no planner is late by accident.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ LATE = {"deadline_ms": 80}
 
 @pytest.fixture
 def episode(site):
-    """Begins an episode by the SDK; keywords are its reset's. Gives the SDK's and the worker's
-    session, and the first observation."""
+    """Start an episode through the SDK. Keyword arguments go to ``reset``. Yields the SDK's
+    session, the worker's session and the first observation."""
 
     @contextlib.contextmanager
     def begin(**spec) -> Iterator[tuple]:
@@ -39,20 +39,20 @@ def kinds(obs: real2sim.Observation) -> list[str]:
 
 
 def miss_deadlines(manual_clock, inside, *, after: real2sim.Observation, to: int) -> None:
-    """Let the planner miss one deadline after another, until the worker has driven on to a step.
+    """Miss deadlines until the worker has driven on to a step.
 
-    The session itself may show a step a moment later than its answer.
+    The session may reach the step slightly after its answer.
     """
     for step in range(after.step + 1, to + 1):
         manual_clock.expire_next()
         wait_until(lambda step=step: inside.world.steps == step, f"step {step}")
 
 
-def test_a_planner_that_hangs_is_driven_on_by_its_last_plan(episode, manual_clock, bystander):
+def test_the_last_plan_continues_while_a_planner_hangs(episode, manual_clock, bystander):
     with episode(**LATE) as (session, inside, _):
         first = session.step(PLAN)
         miss_deadlines(manual_clock, inside, after=first, to=4)
-        # Its observation is sent before the next deadline begins.
+        # The observation is sent before the next deadline starts.
         manual_clock.wait_for_sleeper()
         late = session.step(PLAN)
     assert late.step == 4
@@ -60,7 +60,7 @@ def test_a_planner_that_hangs_is_driven_on_by_its_last_plan(episode, manual_cloc
     assert late.ego.speed > first.ego.speed
 
 
-def test_a_planner_that_hangs_for_good_comes_to_the_end_of_its_episode(episode, manual_clock):
+def test_an_episode_ends_even_if_its_planner_never_answers(episode, manual_clock):
     with episode(horizon=4, **LATE) as (session, inside, first):
         miss_deadlines(manual_clock, inside, after=first, to=4)
         wait_until(lambda: inside.world.over, "the end of the episode")
@@ -68,17 +68,17 @@ def test_a_planner_that_hangs_for_good_comes_to_the_end_of_its_episode(episode, 
     assert (last.step, last.over, last.reason) == (4, True, "horizon")
 
 
-def test_a_late_planner_can_be_braked_for(episode, manual_clock):
+def test_on_timeout_brake_brakes_the_vehicle(episode, manual_clock):
     with episode(on_timeout="brake", **LATE) as (session, inside, first):
         miss_deadlines(manual_clock, inside, after=first, to=3)
         manual_clock.wait_for_sleeper()
         late = session.step(PLAN)
-    # On the way to -6 m/s^2 behind the lag of the brakes.
+    # Braking towards -6 m/s^2, delayed by the brake lag.
     assert -6.0 <= late.ego.acceleration < -1.0
-    assert late.ego.speed < 5.0  # as at the start
+    assert late.ego.speed < 5.0  # the initial speed
 
 
-def test_a_late_planner_can_be_waited_for(episode, manual_clock):
+def test_on_timeout_pause_waits_for_the_planner(episode, manual_clock):
     with episode(on_timeout="pause", **LATE) as (session, inside, _):
         manual_clock.expire_next()
         wait_until(lambda: inside.late, "the deadline to be missed")
@@ -87,7 +87,7 @@ def test_a_late_planner_can_be_waited_for(episode, manual_clock):
         assert kinds(session.step(PLAN)) == []
 
 
-def test_a_late_planner_can_fail_its_episode(episode, manual_clock):
+def test_on_timeout_fail_ends_the_episode(episode, manual_clock):
     with episode(on_timeout="fail", **LATE) as (session, inside, _):
         manual_clock.expire_next()
         wait_until(lambda: inside.world.over, "the end of the episode")
@@ -96,7 +96,7 @@ def test_a_late_planner_can_fail_its_episode(episode, manual_clock):
         assert session.reset(action="control").step == 0
 
 
-def test_an_episode_ends_with_its_wall_clock_time(episode, manual_clock):
+def test_an_episode_ends_at_its_wall_clock_limit(episode, manual_clock):
     with episode(wall_clock_s=0.2) as (session, inside, _):
         manual_clock.expire_next()
         wait_until(lambda: inside.world.over, "the end of the episode")
@@ -104,7 +104,7 @@ def test_an_episode_ends_with_its_wall_clock_time(episode, manual_clock):
         assert (ended.truncated, ended.reason) == (True, "wall_clock")
 
 
-def test_a_late_action_is_stale_and_never_applied(site, join, manual_clock):
+def test_a_late_action_is_stale_and_not_applied(site, join, manual_clock):
     planner = join(site.create())
     planner.reset(**LATE)
     manual_clock.expire_next()
@@ -113,7 +113,7 @@ def test_a_late_action_is_stale_and_never_applied(site, join, manual_clock):
     assert planner.act(0)["code"] == "STALE_STEP"
 
 
-def test_the_clock_stands_while_nobody_is_connected(site, join, manual_clock):
+def test_the_deadline_pauses_without_a_controller(site, join, manual_clock):
     info = site.create()
     first = join(info, None)
     token = first.hello()["resume_token"]
@@ -128,13 +128,13 @@ def test_the_clock_stands_while_nobody_is_connected(site, join, manual_clock):
     assert second.act(0)["step"] == 1
 
 
-def test_measured_latency_is_on_record_and_delays_the_plan(site, join, manual_clock):
+def test_measured_latency_delays_the_plan(site, join, manual_clock):
     planner = join(site.create())
-    # The deadline shows when the observation counts as sent.
+    # The deadline timer shows when the observation counts as sent.
     planner.reset(latency={"model": "measured"}, deadline_ms=900)
     manual_clock.wait_for_sleeper()
     manual_clock.advance(0.25)
-    # A quarter of a second is more than a step: meanwhile the recorded drive goes on.
+    # A quarter of a second is longer than a step. The recorded drive continues in the meantime.
     late, prompt = (planner.act(step, acceleration=-8.0)["ego"]["speed"] for step in (0, 1))
     assert late == pytest.approx(5.0, abs=0.05)
     assert prompt < 4.9
@@ -157,9 +157,7 @@ def test_measured_latency_is_on_record_and_delays_the_plan(site, join, manual_cl
         ({"kind": "pose", "x": 0.0, "y": 0.0, "yaw": 0.0}, "INVALID_ACTION"),
     ],
 )
-def test_plans_that_say_nothing_sensible_are_refused_and_move_nothing(
-    site, join, bystander, plan, code
-):
+def test_invalid_plans_are_refused_and_do_not_advance_the_step(site, join, bystander, plan, code):
     planner = join(site.create())
     planner.reset()
     answer = planner.ask("action", step=0, plan=plan)
@@ -167,7 +165,7 @@ def test_plans_that_say_nothing_sensible_are_refused_and_move_nothing(
     assert planner.act(0)["step"] == 1
 
 
-def test_answers_twice_and_out_of_order_are_told_apart(site, join, bystander):
+def test_repeated_conflicting_and_stale_actions_get_different_answers(site, join, bystander):
     planner = join(site.create())
     planner.reset()
     assert planner.act(0)["step"] == 1
@@ -178,7 +176,7 @@ def test_answers_twice_and_out_of_order_are_told_apart(site, join, bystander):
     assert planner.act(0)["code"] == "STALE_STEP"
 
 
-def test_a_connection_that_drops_in_a_step_disturbs_nobody(site, join, bystander):
+def test_a_connection_lost_during_a_step_does_not_affect_other_sessions(site, join, bystander):
     info = site.create()
     planner = join(info)
     planner.reset(sensors=[{"camera": "front"}])

@@ -1,4 +1,4 @@
-"""Images after impacts: whoever needs kernels that are still being made waits for them alone."""
+"""Images after impacts. Only sessions that need deformation kernels wait for their compilation."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ CAMERA = {"camera": "front", "width": 32}
 
 @pytest.fixture
 def compiler(site, monkeypatch):
-    """Kernels of deformation come when this is set; until then a compiler is at work."""
+    """Deformation kernels are ready once this event is set. Until then they are being compiled."""
     done = threading.Event()
     monkeypatch.setattr(warm_up, "deformation_on_disk", lambda: True)
     monkeypatch.setattr(warm_up, "warm_up_deformation", lambda: done.wait(LIMIT_S))
@@ -27,9 +27,7 @@ def compiler(site, monkeypatch):
     done.set()
 
 
-def test_a_session_with_an_impact_waits_for_the_compiler_and_the_others_go_on(
-    site, join, compiler, monkeypatch
-):
+def test_only_a_session_with_an_impact_waits_for_the_kernels(site, join, compiler, monkeypatch):
     hit, other = (join(site.create()) for _ in range(2))
     hit.reset(sensors=[CAMERA], on_collision="continue")
     other.reset(sensors=[CAMERA])
@@ -45,11 +43,11 @@ def test_a_session_with_an_impact_waits_for_the_compiler_and_the_others_go_on(
     assert hit.act(1)["step"] == 2
 
 
-def test_a_view_after_an_impact_waits_as_well(site, join, compiler, monkeypatch):
+def test_a_view_after_an_impact_waits_for_the_kernels(site, join, compiler, monkeypatch):
     hit = join(site.create())
     hit.reset(sensors=[], on_collision="continue")
     monkeypatch.setattr(DeformationTracker, "has_impacts", True)
-    assert hit.act(0)["step"] == 1  # Nothing is drawn.
+    assert hit.act(0)["step"] == 1  # This step has no images.
     asked = hit.send("render", sensors=[CAMERA])
     with pytest.raises(TimeoutError):
         hit.socket.recv(timeout=0.1)

@@ -1,4 +1,4 @@
-"""The same seed and actions give the same bytes."""
+"""The same seed and actions give identical bytes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ PLANS = [
 
 
 def fingerprint(planner) -> list[str]:
-    """One hash for everything in each observation but its timing."""
+    """Hash of each observation, without its timing."""
     obs = planner.reset(seed=7, action="trajectory", sensors=SENSORS, privileged=True)
     hashes = [hashed(obs)]
     for step, plan in enumerate(PLANS):
@@ -50,18 +50,18 @@ def hashed(obs: dict) -> str:
     return digest.hexdigest()
 
 
-def test_twice_in_one_worker(site, join):
+def test_two_sessions_of_one_worker_are_identical(site, join):
     first = fingerprint(join(site.create()))
     assert fingerprint(join(site.create())) == first
     assert len(set(first)) == len(first)
 
 
-def test_again_after_a_reset(site, join):
+def test_a_reset_repeats_the_episode_exactly(site, join):
     planner = join(site.create())
     assert fingerprint(planner) == fingerprint(planner)
 
 
-def test_while_others_drive(site, join):
+def test_other_sessions_do_not_change_the_result(site, join):
     alone = fingerprint(join(site.create()))
     other = join(site.create())
     other.reset(sensors=[{"camera": "front", "width": 512}])
@@ -69,7 +69,7 @@ def test_while_others_drive(site, join):
     assert fingerprint(join(site.create())) == alone
 
 
-def test_in_a_new_process_with_another_number_of_threads(site, join, tmp_path):
+def test_a_new_process_with_another_thread_count_gives_the_same_result(site, join, tmp_path):
     here = fingerprint(join(site.create()))
     worker = KillableWorker(
         scenes=site.worker.settings.scenes_path,

@@ -1,4 +1,4 @@
-"""The drive socket of a worker, spoken to message by message."""
+"""The drive socket of a worker, message by message."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def pixels(frame: dict) -> np.ndarray:
 # --- welcome and reset ------------------------------------------------------------------------
 
 
-def test_welcome_tells_what_there_is(site, join):
+def test_welcome_lists_cameras_objects_and_time_span(site, join):
     info = site.create()
     answer = join(info, None).hello()
     welcome = SERVER_MESSAGE.validate_python(answer)
@@ -38,7 +38,7 @@ def test_welcome_tells_what_there_is(site, join):
     assert welcome.versions["scene_hash"] == site.session(info).row.scene_hash
 
 
-def test_a_worker_for_small_pictures_drives_as_well(site, join, monkeypatch):
+def test_a_worker_with_a_low_pixel_limit_warms_up_and_drives(site, join, monkeypatch):
     sessions = site.worker.sessions
     for checks in (sessions.pipeline, site.worker.renderer):
         monkeypatch.setattr(checks, "_max_pixels", 1000)
@@ -56,7 +56,7 @@ def test_the_first_observation_shows_step_0(planner):
     assert {"queue", "world", "render", "settle", "encode", "pack"} <= set(obs.timing)
 
 
-def test_all_frames_of_an_observation_are_of_its_instant(planner):
+def test_all_frames_of_an_observation_have_its_timestamp(planner):
     planner.reset(sensors=[CAMERA, {"camera": "left", "modalities": ["rgb", "depth", "instance"]}])
     obs = planner.act(0)
     assert [(f["sensor"], f["modality"]) for f in obs["frames"]] == [
@@ -68,7 +68,7 @@ def test_all_frames_of_an_observation_are_of_its_instant(planner):
     assert {f["t_us"] for f in obs["frames"]} == {obs["t_us"]} == {100_000}
 
 
-def test_whoever_has_an_observation_finds_its_step_by_plain_requests_too(site, join):
+def test_the_state_route_shows_the_step_of_the_last_observation(site, join):
     info = site.create()
     planner = join(info)
     planner.reset(sensors=[CAMERA])
@@ -77,7 +77,7 @@ def test_whoever_has_an_observation_finds_its_step_by_plain_requests_too(site, j
         assert site.call("GET", info, "/state").json()["step"] == step + 1
 
 
-def test_a_slower_camera_comes_only_when_it_is_due(planner):
+def test_a_slower_camera_is_delivered_only_when_due(planner):
     slow = {"camera": "left", "period_us": 300_000}
     obs = planner.reset(sensors=[CAMERA, slow])
     seen = [{f["sensor"] for f in obs["frames"]}]
@@ -87,7 +87,7 @@ def test_a_slower_camera_comes_only_when_it_is_due(planner):
 
 
 @pytest.mark.parametrize("codec", ["raw", "jpeg", "png"])
-def test_frames_come_in_the_codec_asked_for(planner, codec):
+def test_frames_use_the_requested_codec(planner, codec):
     (frame,) = planner.reset(sensors=[CAMERA | {"codec": codec, "width": 48}])["frames"]
     assert (frame["codec"], frame["shape"]) == (codec, [32, 48, 3])
 
@@ -98,7 +98,7 @@ def test_a_raw_frame_shows_the_sky_above_the_road(planner):
     assert top == pytest.approx([127, 178, 229], abs=2)
 
 
-def test_reset_may_come_again_and_begins_from_the_start(planner):
+def test_a_second_reset_starts_from_the_beginning(planner):
     first = planner.reset(sensors=[CAMERA])
     planner.act(0)
     planner.ask("edit", operations=[{"op": "delete", "object_id": "car_red"}])
@@ -119,7 +119,7 @@ def test_reset_may_come_again_and_begins_from_the_start(planner):
         ({"seed": -1}, "BAD_MESSAGE"),
     ],
 )
-def test_a_reset_that_cannot_be_is_refused_and_the_episode_goes_on(planner, spec, code):
+def test_an_invalid_reset_is_refused_and_the_episode_continues(planner, spec, code):
     planner.reset()
     planner.act(0)
     answer = planner.reset(**spec)
@@ -127,7 +127,7 @@ def test_a_reset_that_cannot_be_is_refused_and_the_episode_goes_on(planner, spec
     assert planner.act(1)["step"] == 2
 
 
-def test_progress_is_told_while_the_scene_warms_up(site, join, monkeypatch):
+def test_progress_is_reported_while_the_scene_warms_up(site, join, monkeypatch):
     info = site.create()
     planner = join(info, None)
 
@@ -146,7 +146,7 @@ def test_progress_is_told_while_the_scene_warms_up(site, join, monkeypatch):
     assert planner.receive()["type"] == "welcome"
 
 
-def test_a_step_that_finds_the_engine_busy_may_be_asked_for_again(site, planner, monkeypatch):
+def test_a_step_refused_by_a_busy_engine_can_be_retried(site, planner, monkeypatch):
     planner.reset(sensors=[CAMERA])
 
     async def busy(*_: object, **__: object) -> None:
@@ -160,7 +160,7 @@ def test_a_step_that_finds_the_engine_busy_may_be_asked_for_again(site, planner,
     assert planner.act(0)["step"] == 1
 
 
-def test_more_raw_pixels_than_a_reader_takes_are_refused(planner):
+def test_raw_frames_over_the_message_size_are_refused(planner):
     huge = CAMERA | {"width": 8192, "modalities": ["rgb", "depth"]}
     answer = planner.reset(sensors=[huge])
     assert (answer["code"], answer["fatal"]) == ("INVALID_REQUEST", False)
@@ -169,14 +169,14 @@ def test_more_raw_pixels_than_a_reader_takes_are_refused(planner):
 # --- lock step --------------------------------------------------------------------------------
 
 
-def test_one_action_moves_one_step(planner):
+def test_one_action_advances_one_step(planner):
     planner.reset(dt_us=50_000)
     for step in range(5):
         obs = planner.act(step)
         assert (obs["step"], obs["t_us"]) == (step + 1, (step + 1) * 50_000)
 
 
-def test_the_same_action_again_gets_the_same_observation_under_its_own_id(planner):
+def test_a_repeated_action_gets_the_same_observation_with_its_own_id(planner):
     planner.reset(sensors=[CAMERA])
     first = planner.act(0)
     again = planner.act(0)
@@ -186,7 +186,7 @@ def test_the_same_action_again_gets_the_same_observation_under_its_own_id(planne
     np.testing.assert_equal(again, first)
 
 
-def test_plans_are_the_same_however_they_are_written(planner):
+def test_equal_plans_in_different_encodings_are_the_same_action(planner):
     planner.reset(action="trajectory")
     plan = {"kind": "trajectory", "times_us": [100_000, 200_000], "poses": [[1, 0, 0], [2, 0, 0]]}
     as_arrays = plan | {
@@ -208,7 +208,7 @@ def test_plans_are_the_same_however_they_are_written(planner):
         (2, {"kind": "pose", "x": 1.0, "y": 0.0, "yaw": 0.0}, "INVALID_ACTION"),
     ],
 )
-def test_an_action_that_is_not_due_moves_nothing(planner, step, plan, code):
+def test_an_action_for_the_wrong_step_does_not_advance(planner, step, plan, code):
     planner.reset()
     planner.act(0)
     planner.act(1)
@@ -218,7 +218,7 @@ def test_an_action_that_is_not_due_moves_nothing(planner, step, plan, code):
     assert planner.act(2)["step"] == 3
 
 
-def test_before_the_first_reset_there_is_nothing_to_do(planner):
+def test_actions_edits_and_renders_require_a_reset(planner):
     for answer in (
         planner.act(0),
         planner.ask("edit", operations=[{"op": "delete", "object_id": "post"}]),
@@ -227,7 +227,7 @@ def test_before_the_first_reset_there_is_nothing_to_do(planner):
         assert (answer["type"], answer["code"]) == ("error", "NOT_RESET")
 
 
-def test_after_the_end_only_the_last_observation_can_be_had(planner):
+def test_after_the_end_only_the_last_observation_is_available(planner):
     planner.reset(horizon=2)
     planner.act(0)
     last = planner.act(1)
@@ -237,7 +237,7 @@ def test_after_the_end_only_the_last_observation_can_be_had(planner):
     assert planner.reset()["step"] == 0
 
 
-def test_a_collision_ends_the_episode_and_is_an_event(planner):
+def test_a_collision_ends_the_episode_with_an_event(planner):
     planner.reset(action="pose")
     obs = planner.ask("action", step=0, plan={"kind": "pose", "x": 12.0, "y": -3.0, "yaw": 0.0})
     assert (obs["terminated"], obs["reason"]) == (True, "collision")
@@ -278,7 +278,7 @@ def test_an_asset_is_inserted_into_a_session_without_a_scenario(site, planner):
         ({"operations": []}, "BAD_MESSAGE"),
     ],
 )
-def test_an_edit_that_is_refused_changes_nothing(planner, fields, code):
+def test_a_refused_edit_changes_nothing(planner, fields, code):
     planner.reset(privileged=True)
     operations = [{"op": "delete", "object_id": "post"}]
     answer = planner.ask("edit", **{"operations": operations} | fields)
@@ -287,7 +287,7 @@ def test_an_edit_that_is_refused_changes_nothing(planner, fields, code):
     assert (obs["revision"], len(obs["agents"])) == (0, 3)
 
 
-def test_a_render_does_not_move_time(planner):
+def test_rendering_does_not_advance_time(planner):
     planner.reset()
     planner.act(0)
     view = planner.ask("render", sensors=[CAMERA, {"camera": "left", "codec": "jpeg"}])
@@ -295,7 +295,7 @@ def test_a_render_does_not_move_time(planner):
     assert planner.act(1)["step"] == 2
 
 
-def test_bye_tells_the_result_and_ends_the_session(site, planner):
+def test_bye_returns_the_result_and_closes_the_session(site, planner):
     planner.reset()
     planner.act(0)
     result = SERVER_MESSAGE.validate_python(planner.ask("bye"))
@@ -309,7 +309,7 @@ def test_bye_tells_the_result_and_ends_the_session(site, planner):
 # --- concurrency ------------------------------------------------------------------------------
 
 
-def test_sessions_on_one_scene_do_not_see_each_other(site, join):
+def test_sessions_on_one_scene_are_isolated(site, join):
     one, two = join(site.create()), join(site.create())
     one.reset(privileged=True)
     two.reset(privileged=True)
@@ -330,7 +330,7 @@ def test_pings_are_answered_while_a_step_is_computed(site, join):
     assert planner.receive()["step"] == 1
 
 
-def test_two_planners_at_once_both_get_their_own_answers(site, join):
+def test_concurrent_planners_get_their_own_answers(site, join):
     planners = [join(site.create()) for _ in range(4)]
     wrong: list[object] = []
 
@@ -351,7 +351,7 @@ def test_two_planners_at_once_both_get_their_own_answers(site, join):
     assert not wrong
 
 
-def test_frames_say_where_the_vehicle_takes_itself_to_be(site, join):
+def test_frame_poses_follow_the_estimated_ego_pose(site, join):
     planner = join(site.create())
     cameras = [{"camera": "front", "codec": "raw"}, {"camera": "left", "codec": "jpeg"}]
     exact = planner.reset(sensors=cameras, privileged=True)

@@ -1,4 +1,4 @@
-"""Planners that drive a session as a job, and whoever holds its clock meanwhile."""
+"""Drive jobs on a session, and control of its clock."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ RESET = {"action": "control", "dt_us": 100_000}
 
 @pytest.fixture
 def drive(site):
-    """Begins a drive of a session; gives the answer."""
+    """Start a drive job on a session. Returns the response."""
 
     def begin(info, **body):
         return site.call("POST", info, "/drive", json=body)
@@ -29,7 +29,7 @@ def drive(site):
 
 
 def steps_to(site, info, step: int) -> dict:
-    """The state once the clock has come to a step."""
+    """The state once the clock has reached a step."""
     state: dict = {"step": 0}
     for _ in range(20):
         after = {"after": state["step"], "wait_s": 5}
@@ -43,7 +43,7 @@ def ended(site, job: dict) -> dict:
     return finished(site.http, f"/v1/jobs/{job['job_id']}")
 
 
-def test_who_drives_by_requests_leaves_a_recording_with_everything_of_every_instant(site, drive):
+def test_a_drive_by_requests_records_every_step(site, drive):
     info = site.create(RESET)
     job = drive(info, planner=None, steps=4).json()
     for _ in range(4):
@@ -57,12 +57,12 @@ def test_who_drives_by_requests_leaves_a_recording_with_everything_of_every_inst
     lengths = {len(values) for values in (shown["plans"], *shown["metrics"].values())}
     assert lengths == {5}
     last = site.call("GET", info, "/state").json()["ego"]["position"]
-    # The body of the vehicle squats a little.
+    # The suspension compresses slightly.
     assert shown["ego"]["positions"][-1] == pytest.approx(last, abs=1e-2)
     assert {"car_red", "car_blue"} <= shown["tracks"].keys()
 
 
-def test_a_planner_of_the_sdk_is_held_let_go_by_steps_and_ended(site, drive):
+def test_a_planner_is_held_stepped_and_stopped_by_the_clock(site, drive):
     info = site.create({"dt_us": 100_000, "seed": 3, "on_collision": "continue"})
     site.call("PUT", info, "/clock", json={"state": "held", "steps": 2})
     job = drive(info, planner="follow_route").json()
@@ -82,7 +82,7 @@ def test_a_planner_of_the_sdk_is_held_let_go_by_steps_and_ended(site, drive):
     assert (shown["scenario_id"], shown["reason"]) == (None, "stopped")
 
 
-def test_a_drive_is_looked_at_from_its_own_vehicle(site, drive):
+def test_a_drive_is_previewed_from_its_own_vehicle(site, drive):
     info = site.create(RESET)
     job = drive(info, planner=None, steps=5).json()
     harder = {"kind": "control", "acceleration": 3.0, "steering": 0.0}
@@ -105,7 +105,7 @@ def test_a_drive_is_looked_at_from_its_own_vehicle(site, drive):
 
 
 @pytest.mark.parametrize("end", ["cancel", "delete"])
-def test_a_drive_that_nobody_has_begun_can_be_cancelled_and_ends_with_its_session(site, drive, end):
+def test_an_unstarted_drive_is_cancelled_or_fails_with_its_session(site, drive, end):
     info = site.create()
     job = drive(info, planner=None).json()
     if end == "cancel":
@@ -118,7 +118,7 @@ def test_a_drive_that_nobody_has_begun_can_be_cancelled_and_ends_with_its_sessio
         assert "the planner did not drive" in done["error"]["detail"]
 
 
-def test_a_fork_of_an_earlier_step_goes_on_from_there_as_the_first_did(site):
+def test_a_fork_at_an_earlier_step_repeats_the_original(site):
     info = site.create(RESET)
     states = [
         site.call("POST", info, "/step", json={"n": 1, "plan": CONTROL}).json() for _ in range(4)
@@ -134,7 +134,7 @@ def test_a_fork_of_an_earlier_step_goes_on_from_there_as_the_first_did(site):
     assert "at 4" in refused.json()["detail"]
 
 
-def test_the_command_drives_a_session_that_is_there(site, drive):
+def test_the_command_drives_an_existing_session(site, drive):
     info = site.create()
     job = drive(info, planner=None, steps=3).json()
     arguments = ("--session", info["session_id"], "--session-token", info["token"])
@@ -144,7 +144,7 @@ def test_the_command_drives_a_session_that_is_there(site, drive):
     assert ended(site, job)["result"]["steps"] == 3
 
 
-def test_the_sdk_holds_a_clock(site):
+def test_the_sdk_holds_the_clock(site):
     with real2sim.connect(site.url) as client:
         info = client.sessions.create(scene="tiny")
         assert client.sessions.set_clock(info.session_id, "held", steps=1).held is False
@@ -152,7 +152,7 @@ def test_the_sdk_holds_a_clock(site):
         client.sessions.delete(info.session_id)
 
 
-def test_a_clock_lets_so_many_actions_pass():
+def test_a_held_clock_allows_a_number_of_actions():
     hold = ClockHold()
     assert hold.free
     hold.hold(after=2)
@@ -165,7 +165,7 @@ def test_a_clock_lets_so_many_actions_pass():
     assert (hold.free, hold.wait_s) == (True, 0.0)
 
 
-def test_a_paced_clock_lets_the_next_action_wait_for_the_rest_of_its_step():
+def test_a_paced_clock_delays_the_next_action():
     hold = ClockHold()
     hold.release(pace=0.5)
     assert (hold.free, hold.wait_s) == (False, 0.0)

@@ -1,4 +1,4 @@
-"""The Gymnasium environment against a worker as it is."""
+"""The Gymnasium environment against a real worker."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def test_check_env_passes(env):
         check_env(env, skip_render_check=True)
 
 
-def test_the_seed_of_reset_draws_what_is_randomized(env):
+def test_the_reset_seed_determines_the_randomization(env):
     ranges = {"randomization": {"start": {"lateral": 0.5, "speed": 2.0}}}
     seen, infos = zip(*(env.reset(seed=s, options=ranges) for s in (1, 1, 2)), strict=True)
     assert set(infos[0]["drawn"]) == {"start.lateral", "start.speed"}
@@ -38,13 +38,13 @@ def test_the_seed_of_reset_draws_what_is_randomized(env):
     assert unseeded[0] != unseeded[1]
 
 
-def test_seeds_change_nothing_where_nothing_is_randomized(env):
+def test_seeds_have_no_effect_without_randomization(env):
     (first, info), (other, _) = env.reset(seed=1), env.reset(seed=2)
     assert info["drawn"] == {}
     assert all((first[k] == other[k]).all() for k in first)
 
 
-def test_lidars_and_radars_are_rows_of_numbers(site):
+def test_lidars_and_radars_are_arrays_of_points(site):
     made = real2sim.make_env(
         url=site.url, scene="tiny", lidars=["vlp-16"], radars=["corner"], points=64
     )
@@ -54,7 +54,7 @@ def test_lidars_and_radars_are_rows_of_numbers(site):
         assert made.observation_space.contains(obs)
         assert obs["vlp-16"].any()
         assert obs["corner"].shape == (256, 5)
-        # Every so manieth return, not the first ones.
+        # Evenly spaced returns, not the first ones.
         sweep = made.last.lidar("vlp-16")
         assert sweep.count > 64
         np.testing.assert_array_equal(
@@ -65,7 +65,7 @@ def test_lidars_and_radars_are_rows_of_numbers(site):
         made.close()
 
 
-def test_who_changes_an_observation_does_not_change_the_next_one(site):
+def test_changing_an_observation_does_not_affect_the_next(site):
     slow = {"camera": "front", "period_us": 300_000}
     made = real2sim.make_env(url=site.url, scene="tiny", sensors=[slow], render_mode="rgb_array")
     try:
@@ -80,7 +80,7 @@ def test_who_changes_an_observation_does_not_change_the_next_one(site):
         made.close()
 
 
-def test_an_episode_by_random_actions_ends(env):
+def test_an_episode_with_random_actions_ends(env):
     env.action_space.seed(0)
     obs, _ = env.reset(seed=1)
     assert env.observation_space.contains(obs)
@@ -95,7 +95,7 @@ def test_an_episode_by_random_actions_ends(env):
     assert env.render().shape == (64, 96, 3)
 
 
-def test_the_way_made_is_the_reward(env):
+def test_the_reward_is_the_distance_driven(env):
     env.reset(seed=1)
     _, reward, *_ = env.step(np.zeros(2, np.float32))
     assert reward == pytest.approx(0.5, abs=0.01)
@@ -103,7 +103,7 @@ def test_the_way_made_is_the_reward(env):
 
 @pytest.fixture
 def made(site):
-    """Environments of the tiny scene that end with the test."""
+    """Create environments on the tiny scene that are closed after the test."""
     opened = []
 
     def make(**options):
@@ -115,7 +115,7 @@ def made(site):
         env.close()
 
 
-def test_depth_and_instances_have_keys_of_their_own(made):
+def test_depth_and_instance_images_have_their_own_keys(made):
     sensor = {"camera": "front", "modalities": ["rgb", "depth", "instance"], "width": 48}
     env = made(sensors=[sensor, {"camera": "left", "modalities": ["depth"]}])
     obs, _ = env.reset(seed=0)
@@ -131,7 +131,7 @@ def test_depth_and_instances_have_keys_of_their_own(made):
     assert obs["front/depth"].max() > 5.0
 
 
-def test_without_cameras_the_nearest_agents_are_shown(made, tiny_scene):
+def test_without_cameras_the_nearest_agents_are_observed(made, tiny_scene):
     env = made()
     obs, _ = env.reset(seed=0)
     assert env.observation_space.contains(obs)
@@ -145,7 +145,7 @@ def test_without_cameras_the_nearest_agents_are_shown(made, tiny_scene):
     assert not obs["agents"][3:].any()
 
 
-def test_agents_turn_with_the_vehicle(made):
+def test_agents_are_in_the_vehicle_frame(made):
     env = made(agents=2, options={"ego": {"max_steer": 0.6}})
     env.reset(seed=0)
     for _ in range(10):
@@ -160,7 +160,7 @@ def test_agents_turn_with_the_vehicle(made):
     assert np.linalg.norm((x, y)) == pytest.approx(np.linalg.norm(offsets, axis=1).min(), abs=1e-4)
 
 
-def test_agents_are_not_shown_beside_cameras_unless_asked_for(made):
+def test_agents_are_added_to_cameras_only_on_request(made):
     assert "agents" not in made(sensors=["front"]).observation_space.spaces
     assert made(sensors=["front"], agents=4).observation_space["agents"].shape == (4, 9)
 
@@ -176,7 +176,7 @@ def test_the_registered_environment_passes_check_env(site):
     env.close()
 
 
-def test_a_vector_environment_of_gymnasium_steps_many_sessions(site):
+def test_a_gymnasium_vector_environment_steps_several_sessions(site):
     options = {"num_envs": 2, "url": site.url, "scene": "tiny", "vectorization_mode": "sync"}
     env = gymnasium.make_vec("real2sim.env:real2sim/Drive-v0", **options)
     env.reset(seed=0)
@@ -200,7 +200,7 @@ def test_a_vector_environment_of_gymnasium_steps_many_sessions(site):
         ),
     ],
 )
-def test_what_cannot_be_shown_is_refused_and_leaves_no_session(site, made, options, said):
+def test_an_invalid_environment_is_refused_and_leaves_no_session(site, made, options, said):
     with pytest.raises(ValueError, match=said):
         made(**options)
     assert len(site.worker.sessions) == 0
@@ -208,7 +208,7 @@ def test_what_cannot_be_shown_is_refused_and_leaves_no_session(site, made, optio
 
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
-def test_ppo_of_stable_baselines3_runs_2000_steps_without_changes(env):
+def test_stable_baselines3_ppo_trains_for_2000_steps(env):
     sb3 = pytest.importorskip("stable_baselines3", reason="pip install stable-baselines3")
     from stable_baselines3.common.env_checker import check_env
 

@@ -1,4 +1,4 @@
-"""Rule 1, without a world."""
+"""The lock-step rule, without a world."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ def test_the_due_action_has_no_answer_yet():
     assert begun(3).cached_answer(3, b"anything") is None
 
 
-def test_the_same_action_again_gets_the_same_answer():
+def test_a_repeated_action_gets_the_cached_answer():
     assert begun(3).cached_answer(2, b"plan 2") == "obs 3"
 
 
-def test_another_action_for_an_answered_step_is_a_conflict():
+def test_a_different_action_for_an_answered_step_conflicts():
     assert error(begun(3), 2, b"other") is ErrorCode.STEP_CONFLICT
 
 
@@ -46,15 +46,15 @@ def test_only_the_last_answer_is_kept():
     assert error(begun(3), 1, b"plan 1") is ErrorCode.STALE_STEP
 
 
-def test_an_action_from_the_future_is_refused():
+def test_an_action_for_a_future_step_is_refused():
     assert error(begun(3), 4) is ErrorCode.BAD_STEP
 
 
-def test_nothing_can_be_done_before_a_reset():
+def test_actions_require_a_reset():
     assert error(LockStep(), 0) is ErrorCode.NOT_RESET
 
 
-def test_after_the_end_the_last_answer_can_be_had_again_and_nothing_else():
+def test_after_the_end_only_the_last_answer_is_available():
     lockstep = begun(2)
     lockstep.advance(b"last", "end", over=True)
     assert lockstep.cached_answer(2, b"last") == "end"
@@ -62,7 +62,7 @@ def test_after_the_end_the_last_answer_can_be_had_again_and_nothing_else():
     assert error(lockstep, 4) is ErrorCode.EPISODE_OVER
 
 
-def test_a_reset_forgets_the_episode_before():
+def test_a_reset_discards_the_previous_episode():
     lockstep = begun(3)
     lockstep.reset()
     assert lockstep.step == 0
@@ -70,7 +70,7 @@ def test_a_reset_forgets_the_episode_before():
     assert lockstep.cached_answer(0, b"plan 0") is None
 
 
-def test_steps_made_by_other_means_leave_no_answer():
+def test_skipped_steps_have_no_cached_answer():
     lockstep = begun(3)
     lockstep.skip(4, over=False)
     assert lockstep.step == 7
@@ -78,7 +78,7 @@ def test_steps_made_by_other_means_leave_no_answer():
 
 
 @given(ACTIONS)
-def test_the_clock_moves_exactly_once_for_each_accepted_action(actions):
+def test_each_accepted_action_advances_the_step_exactly_once(actions):
     lockstep = begun()
     taken: list[bytes] = []
     for offset, content in actions:

@@ -1,4 +1,4 @@
-"""Messages of clients: actions are read by a way of their own, with the same outcome."""
+"""Client messages: the fast path for actions gives the same result as the general parser."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def outcome(read, data: bytes) -> object:
         {"plan": TRAJECTORY | {"times_us": np.array([1, 2]), "poses": np.zeros((2, 3))}},
     ],
 )
-def test_an_action_is_read_at_once_and_as_any_message_is(monkeypatch, changes):
+def test_the_fast_path_reads_an_action_like_the_general_parser(monkeypatch, changes):
     data = encode_arrays(ACTION | changes)
     slowly = _read(data)
     monkeypatch.setattr(messages, "_read", None)
@@ -68,7 +68,7 @@ def test_an_action_is_read_at_once_and_as_any_message_is(monkeypatch, changes):
         encode({"v": 1, "id": 1, "type": "bye"}),
     ],
 )
-def test_whatever_else_comes_is_answered_as_before(data):
+def test_other_messages_are_handled_like_by_the_general_parser(data):
     def slowly(data: bytes) -> object:
         message = _read(data)
         content = b"" if message.type != "action" else messages.plan_payload(message.plan)

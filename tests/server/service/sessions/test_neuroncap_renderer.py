@@ -1,7 +1,7 @@
-"""A worker's pictures behind NeuroNCAP's renderer interface.
+"""The NeuroNCAP renderer interface of a worker.
 
-With REAL2SIM_NEURONCAP naming a checkout of atonderski/neuro-ncap (MIT), they are asked for by its
-own client too, which needs httpx and torch.
+If REAL2SIM_NEURONCAP names a checkout of atonderski/neuro-ncap (MIT), its own client is tested too
+(needs httpx and torch).
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ LATER = 1_531_883_530_449_377
 
 @pytest.fixture
 def serve(site):
-    """Serves the tiny scene by a link; a client of it."""
+    """Serve the tiny scene with a link. Returns an HTTP client."""
     with real2sim.connect(site.url) as client:
         started = []
 
@@ -77,12 +77,12 @@ def drawn(site, **options):
 
 
 def alike(image, other) -> bool:
-    """A pose that went through a quaternion may round a pixel the other way."""
+    """Whether images are equal up to rounding errors of poses converted to quaternions."""
     return np.abs(image.astype(int) - other).mean() < 0.01
 
 
 def seen_at(scene, image, point):
-    """Red, green and blue of a point of the world in the front camera at the start."""
+    """Red, green and blue of a world point in the front camera at the start."""
     front = scene.rig["front"]
     x, y, z = (front.viewmat(np.eye(4)) @ [*point, 1.0])[:3]
     u, v, _ = front.K @ (x / z, y / z, 1.0)
@@ -95,13 +95,13 @@ def moved(actor, x, y, z, *, times=(0, 2_000_000)):
     return actor | {"timestamps": list(times), "poses": [pose.tolist()] * len(times)}
 
 
-def test_it_says_that_it_is_alive_and_when_the_scene_starts(serve):
+def test_alive_and_start_time_are_served(serve):
     http = serve(offset_us=LATER)
     assert http.get("/alive").json() is True
     assert http.get("/start_time").json() == LATER
 
 
-def test_actors_are_the_objects_with_width_before_length(serve, tiny_scene):
+def test_actors_list_all_objects_with_width_before_length(serve, tiny_scene):
     listed = {a["uuid"]: a for a in serve().get("/get_actors").json()}
     assert set(listed) == {"car_red", "car_blue", "post"}
     blue = tiny_scene.objects["car_blue"]
@@ -112,14 +112,12 @@ def test_actors_are_the_objects_with_width_before_length(serve, tiny_scene):
 
 
 @pytest.mark.parametrize(("camera", "ours"), [("CAM_FRONT", "front"), ("CAM_FRONT_LEFT", "left")])
-def test_until_actors_are_updated_the_picture_is_the_recorded_one(
-    serve, site, tiny_scene, camera, ours
-):
+def test_without_an_update_the_recorded_image_is_rendered(serve, site, tiny_scene, camera, ours):
     image = render(serve(), camera_at(tiny_scene, 1_000_000, ours), 1_000_000, camera=camera)
     assert alike(pixels(image), drawn(site, camera=ours, t_us=1_000_000))
 
 
-def test_updated_actors_are_where_and_as_long_as_they_are_said_to_be(serve, tiny_scene):
+def test_updated_actors_are_rendered_at_their_new_poses(serve, tiny_scene):
     http = serve()
     (red,) = [a for a in http.get("/get_actors").json() if a["uuid"] == "car_red"]
     there = (12.0, 0.0, 0.75)
@@ -128,13 +126,13 @@ def test_updated_actors_are_where_and_as_long_as_they_are_said_to_be(serve, tiny
         tiny_scene, pixels(render(http, camera_at(tiny_scene, 0), 0)), there
     )
     assert red_value - green > 60
-    # Actors that are not named are gone, and nobody is there outside of the times given.
+    # Actors missing from an update are removed, and exist only between their first and last time.
     gone = pixels(render(http, camera_at(tiny_scene, 0), 2_100_000))
     http.post("/update_actors", json=[])
     assert np.array_equal(gone, pixels(render(http, camera_at(tiny_scene, 0), 0)))
 
 
-def test_between_its_times_an_actor_is_in_between(serve, tiny_scene):
+def test_actor_poses_are_interpolated(serve, tiny_scene):
     http = serve()
     (red,) = [a for a in http.get("/get_actors").json() if a["uuid"] == "car_red"]
     poses = [np.eye(4), np.eye(4)]
@@ -148,7 +146,7 @@ def test_between_its_times_an_actor_is_in_between(serve, tiny_scene):
     assert listed["car_red"]["poses"][0][0][3] == 12.0
 
 
-def test_another_world_clock_and_names_are_translated(serve, site, tiny_scene):
+def test_world_frame_clock_and_object_names_are_converted(serve, site, tiny_scene):
     rows = tuple(map(tuple, SHIFTED.tolist()))
     http = serve(T_world_theirs=rows, offset_us=LATER, objects={"token": "car_red"})
     theirs = invert_transform(SHIFTED)
@@ -160,7 +158,7 @@ def test_another_world_clock_and_names_are_translated(serve, site, tiny_scene):
     np.testing.assert_allclose(SHIFTED @ red, tiny_scene.objects["car_red"].trajectory.transform(0))
 
 
-def test_raw_images_are_saved_tensors_in_base64(serve, site, tiny_scene):
+def test_raw_images_are_base64_encoded_tensors(serve, site, tiny_scene):
     response = render(serve(), camera_at(tiny_scene, 0), 0, image_format="raw")
     tensor = torch.load(io.BytesIO(base64.b64decode(response.text)))
     assert tensor.dtype is torch.uint8
@@ -195,7 +193,7 @@ def test_raw_images_are_saved_tensors_in_base64(serve, site, tiny_scene):
         ("/set_actor_scale", 1.0, 404, "there are GET /alive"),
     ],
 )
-def test_what_cannot_be_served_is_refused_and_the_rest_goes_on(
+def test_an_invalid_request_is_refused_and_the_service_continues(
     serve, tiny_scene, path, body, status, said
 ):
     http = serve()
@@ -208,7 +206,7 @@ def test_what_cannot_be_served_is_refused_and_the_rest_goes_on(
     assert render(http, camera_at(tiny_scene, 0), 0).status_code == 200
 
 
-def test_a_link_that_names_no_camera_of_the_scene_is_refused_at_once(serve):
+def test_a_link_to_an_unknown_camera_is_refused_immediately(serve):
     with pytest.raises(PeerError, match="camera 'roof', given for 'CAM_FRONT', does not exist"):
         serve(cameras={"CAM_FRONT": "roof"})
 
@@ -222,7 +220,7 @@ def their_client(serve):
     if not checkout:
         pytest.skip("REAL2SIM_NEURONCAP names no checkout of atonderski/neuro-ncap")
     pytest.importorskip("httpx")
-    # Its package imports nuScenes' toolkit and more, which the client does not use.
+    # Its package imports nuScenes' toolkit and other packages that the client does not use.
     for name in ("neuro_ncap", "neuro_ncap.components"):
         package = types.ModuleType(name)
         package.__path__ = [str(Path(checkout, *name.split(".")))]
@@ -257,7 +255,7 @@ def test_neuroncaps_client_renders_and_moves_actors(their_client, site, tiny_sce
 @pytest.mark.parametrize(
     ("command", "options"), [("alpasim-renderer", []), ("neuroncap-renderer", ["--scene", "tiny"])]
 )
-def test_the_command_says_where_it_listens_and_ends_by_interrupt(site, command, options):
+def test_the_adapter_command_prints_its_address_and_stops_on_interrupt(site, command, options):
     arguments = ["adapter", command, "--url", site.url, "--port", "0", *options]
     process = subprocess.Popen(
         [sys.executable, "-m", "real2sim", *arguments], stdout=subprocess.PIPE, text=True

@@ -1,4 +1,4 @@
-"""Those who look on while another client drives."""
+"""Observers of a session that another client controls."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ pytestmark = pytest.mark.network
 CAMERA = {"camera": "front"}
 
 
-def test_observers_get_every_observation_with_id_0(site, join):
+def test_observers_receive_every_observation_with_id_0(site, join):
     info = site.create()
     controller = join(info)
     watching = [join(info, "observer") for _ in range(2)]
@@ -30,7 +30,7 @@ def test_observers_get_every_observation_with_id_0(site, join):
         ("edit", {"operations": [{"op": "delete", "object_id": "post"}]}),
     ],
 )
-def test_observers_may_not_change_anything(site, join, type_, fields):
+def test_observers_cannot_change_the_session(site, join, type_, fields):
     info = site.create()
     controller, observer = join(info), join(info, "observer")
     controller.reset()
@@ -39,7 +39,7 @@ def test_observers_may_not_change_anything(site, join, type_, fields):
     assert controller.act(0)["revision"] == 0
 
 
-def test_observers_may_render_and_leave(site, join):
+def test_observers_can_render_and_leave(site, join):
     info = site.create()
     controller, observer = join(info), join(info, "observer")
     controller.reset()
@@ -50,10 +50,10 @@ def test_observers_may_render_and_leave(site, join):
     assert controller.act(0)["step"] == 1
 
 
-def test_an_observer_that_does_not_read_never_holds_up_the_controller(site, join):
+def test_a_slow_observer_does_not_block_the_controller(site, join):
     info = site.create()
     controller = join(info)
-    # A client stops reading from its socket while its queue is full.
+    # A client stops reading from its socket when its queue is full.
     join(info, "observer", max_queue=1)
     controller.reset(sensors=[CAMERA | {"width": 1024, "modalities": ["rgb", "depth"]}], dt_us=1000)
     for step in range(20):

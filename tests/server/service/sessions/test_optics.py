@@ -20,7 +20,7 @@ NOISE = {"noise": {"photon": 0.001, "read": 0.01}}
 
 @pytest.fixture(autouse=True, scope="module")
 def lens_kernels():
-    """On disk, so that no reset waits for them."""
+    """Cache the kernels on disk, so that no reset waits for them."""
     warm_up_lenses("cpu")
 
 
@@ -35,7 +35,7 @@ def drive(join, site, **sensor):
     return obs["frames"][0], planner.act(0)["frames"][0]
 
 
-def test_a_session_sees_through_its_lens_and_says_so(site, join):
+def test_frames_report_their_lens_shutter_and_effects(site, join):
     _, plain = drive(join, site)
     _, seen = drive(join, site, optics=ROLLING, effects=NOISE)
     assert (seen["lens"], seen["shutter"], seen["effects"]) == (
@@ -48,12 +48,12 @@ def test_a_session_sees_through_its_lens_and_says_so(site, join):
     assert (image(seen) != image(plain)).mean() > 0.2
 
 
-def test_the_same_drive_gives_the_same_pixels_again(site, join):
+def test_a_repeated_drive_gives_identical_pixels(site, join):
     both = [drive(join, site, optics=ROLLING, effects=NOISE)[1] for _ in range(2)]
     np.testing.assert_array_equal(*map(image, both))
 
 
-def test_motion_blur_is_drawn(site, join):
+def test_motion_blur_changes_the_image(site, join):
     blur = {"motion_blur": {"exposure_us": 100_000, "samples": 3}}
     (_, sharp), (_, blurred) = drive(join, site), drive(join, site, effects=blur)
     assert blurred["effects"] == ["motion_blur"]

@@ -1,4 +1,4 @@
-"""A step passes the named phases, in the order that the pipeline states."""
+"""A step runs the documented phases in order."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ pytestmark = pytest.mark.network
 
 CAMERA = {"camera": "front", "width": 160, "codec": "raw"}
 PHASES = re.findall(r"(?m)^``(\w+)``", pipeline.__doc__ or "")
-"""As the module's docstring states them."""
+"""From the docstring of the module."""
 
 
 @pytest.fixture
 def passed(monkeypatch) -> list[tuple[str, str]]:
-    """(phase, thread) of every phase that begins."""
+    """(phase, thread) of every started phase."""
     phases: list[tuple[str, str]] = []
 
     def note(owner: type, method: str, phase: str) -> None:
@@ -40,21 +40,21 @@ def passed(monkeypatch) -> list[tuple[str, str]]:
     return phases
 
 
-def test_the_phases_are_those_of_the_docstring():
+def test_the_phases_are_the_documented_ones():
     assert PHASES == ["receive", "check", "advance", "render", "evaluate", "encode", "send"]
 
 
-def test_an_action_with_raw_images_passes_every_phase_once(planner, passed):
+def test_an_action_with_raw_images_runs_every_phase_once(planner, passed):
     planner.reset(sensors=[CAMERA])
     passed.clear()
     assert planner.act(0)["step"] == 1
     seen = [phase for phase, _ in passed if phase != "receive"]
-    # Evaluation begins beside the rendering.
+    # Evaluation overlaps with rendering.
     assert sorted(seen[2:4]) == ["evaluate", "render"]
     assert [seen[0], seen[1], *seen[4:]] == ["check", "advance", "encode", "send"]
 
 
-def test_the_engine_renders_while_another_thread_evaluates(planner, passed):
+def test_evaluation_runs_on_another_thread_than_rendering(planner, passed):
     planner.reset(sensors=[CAMERA])
     passed.clear()
     planner.act(0)
@@ -64,7 +64,7 @@ def test_the_engine_renders_while_another_thread_evaluates(planner, passed):
     assert threads["check"] == threads["send"] != "engine"
 
 
-def test_a_world_without_sensors_leaves_the_engine_alone(planner, passed):
+def test_a_world_without_sensors_does_not_use_the_engine(planner, passed):
     planner.reset(sensors=[])
     passed.clear()
     planner.act(0)

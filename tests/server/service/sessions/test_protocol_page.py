@@ -1,4 +1,4 @@
-"""The page of the wire contract says what a client in another language has to know."""
+"""The protocol page documents what a client in another language needs."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ PAGE = (Path(__file__).resolve().parents[4] / "docs" / "protocol.md").read_text(
 
 
 def section(title: str) -> str:
-    """Text under a heading, up to the next one of the same depth."""
+    """Text under a heading, up to the next heading of the same level."""
     found = re.search(rf"^(#+) {title}\n(.*?)(?=^#|\Z)", PAGE, re.M | re.S)
     assert found, title
     return found.group(2)
 
 
 def first_cells(text: str) -> set[str]:
-    """What stands in backquotes, or as numbers, in the first column of tables."""
+    """Backquoted names and numbers in the first column of tables."""
     cells = [line.split("|")[1] for line in text.splitlines() if line.startswith("|")]
     return {word for cell in cells for word in re.findall(r"[a-z_0-9]+", cell)}
 
 
 @pytest.fixture
 def observed(site, join) -> dict[str, Any]:
-    """An observation with an image, after a collision with the car that is ahead."""
+    """An observation with an image, after a collision with the lead vehicle."""
     planner = join(site.create())
     sensors = [{"camera": "front", "codec": "raw"}]
     contact = {"on_collision": "continue", "contact": {"dents": False}}
@@ -47,22 +47,22 @@ def observed(site, join) -> dict[str, Any]:
     return obs
 
 
-def test_every_close_code_is_on_the_page():
+def test_every_close_code_is_documented():
     rows = first_cells(section("Closing"))
     ours = {NORMAL_CLOSURE, POLICY_VIOLATION}
-    # Of libraries: no UTF-8, too large, an error or no pong, stopping, restarting.
+    # Sent by libraries: invalid UTF-8, too large, error or missing pong, stopping, restarting.
     theirs = {1007, 1009, 1011, 1001, 1012}
     assert {str(code) for code in ours | theirs} <= rows
 
 
-def test_statuses_of_a_refused_handshake_are_those_of_their_codes():
+def test_documented_handshake_statuses_match_their_codes():
     text = section("Closing").partition("A handshake that fails")[2]
     named = re.findall(r"(\d{3}) \(`(\w+)`", text)
     assert len(named) == 4
     assert all(HTTP_STATUS[ErrorCode(code)] == int(status) for status, code in named)
 
 
-def test_every_event_and_its_data_are_on_the_page(observed):
+def test_every_event_and_its_data_are_documented(observed):
     text = section("Observations")
     assert set(get_args(EventType)) <= first_cells(text)
     declared = Event.model_json_schema()["properties"]["type"]["enum"]
@@ -72,20 +72,20 @@ def test_every_event_and_its_data_are_on_the_page(observed):
         assert lacking == [], event["type"]
 
 
-def test_every_metric_is_on_the_page(observed):
+def test_every_metric_is_documented(observed):
     rows = first_cells(section("Observations"))
     assert set(observed["metrics"]) <= rows
     assert {name for name, metric in METRICS.items() if metric.streamed} <= rows
     assert "ttc" in rows
 
 
-def test_every_field_of_an_observation_is_on_the_page():
+def test_every_observation_field_is_documented():
     text = section("Observations")
     fields = (set(Obs.model_fields) | set(EgoState.model_fields)) - {"v", "type", "id"}
     assert [name for name in sorted(fields) if f"`{name}`" not in text] == []
 
 
-def test_arrays_have_the_shapes_of_the_page(observed):
+def test_arrays_have_the_documented_shapes(observed):
     frame = observed["frames"][0]
     arrays = {"route": observed["route"], "K": frame["K"]}
     arrays["T_world_sensor"] = frame["T_world_sensor"]
@@ -97,14 +97,14 @@ def test_arrays_have_the_shapes_of_the_page(observed):
         assert said.groups() == (array.dtype.name, str(list(array.shape)))
 
 
-def test_what_a_returning_controller_says_is_on_the_page():
+def test_the_fields_of_resume_are_documented():
     text = section("Resuming")
     assert all(re.search(rf"\b{name}\b", text) for name in Resume.model_fields)
     assert "resume" in Hello.model_fields
     assert "`id` 0" in text
 
 
-def test_a_session_wants_its_token_where_the_worker_has_none(site):
+def test_a_session_requires_its_token_even_without_a_worker_token(site):
     info = site.create()
     url = f"/v1/sessions/{info['session_id']}"
     refused = site.http.get(url)
@@ -112,7 +112,7 @@ def test_a_session_wants_its_token_where_the_worker_has_none(site):
     assert site.call("GET", info).status_code == 200
 
 
-def test_unasked_messages_have_id_0_and_the_page_says_which():
+def test_unsolicited_messages_are_documented_with_id_0():
     text = section("Rules")
     assert all(name in text for name in ("`obs`", "`progress`", "`error`", "`deadline_missed`"))
     assert "`id` 0" in text

@@ -1,4 +1,4 @@
-"""Log entries of several sessions: one transaction, and the trouble of one is not the others'."""
+"""Log entries of several sessions share a transaction. One failure does not affect the others."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from real2sim_server.service.storage.store import SessionEntry, Store
 
 
 class Shelf:
-    """A store that refuses the entries of some sessions."""
+    """A store that refuses entries of some sessions."""
 
     def __init__(self, refused: Sequence[str] = ()) -> None:
         self.refused = set(refused)
@@ -27,7 +27,7 @@ class Shelf:
 
 
 def recorded(shelf: Shelf, names: Sequence[str], *, unsure: Sequence[str] = ()) -> dict[str, Any]:
-    """What has gone wrong, by session."""
+    """Errors by session."""
     entries = [SessionEntry(1, "action", 0, b"", 0)]
     steps = {
         name: Step(
@@ -41,13 +41,13 @@ def recorded(shelf: Shelf, names: Sequence[str], *, unsure: Sequence[str] = ()) 
     return {name: step.error for name, step in steps.items() if step.error is not None}
 
 
-def test_entries_of_several_sessions_are_one_transaction() -> None:
+def test_entries_of_several_sessions_share_one_transaction() -> None:
     shelf = Shelf()
     assert recorded(shelf, ["a", "b", "c"]) == {}
     assert shelf.transactions == [["a", "b", "c"]]
 
 
-def test_the_trouble_of_one_is_not_that_of_the_others() -> None:
+def test_a_failing_session_does_not_affect_the_others() -> None:
     shelf = Shelf(refused=["b"])
     failed = recorded(shelf, ["a", "b", "c"])
     assert list(failed) == ["b"]
@@ -55,7 +55,7 @@ def test_the_trouble_of_one_is_not_that_of_the_others() -> None:
     assert shelf.transactions == [["a"], ["c"]]
 
 
-def test_a_log_whose_end_is_unsure_is_written_by_itself() -> None:
+def test_a_log_with_an_uncertain_end_is_written_separately() -> None:
     shelf = Shelf()
     assert recorded(shelf, ["a", "b"], unsure=["b"]) == {}
     assert shelf.transactions == [["a"], ["b"]]

@@ -1,4 +1,4 @@
-"""Recordings fetched from a worker, and replayed by the command."""
+"""Recordings downloaded from a worker and replayed by the command."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ runner = CliRunner()
 
 @pytest.fixture
 def recorded(site, tmp_path):
-    """A file of an episode with a missed deadline, an edit and images, and its last observation."""
+    """Recording of an episode with a missed deadline, an edit and images. Also returns the last
+    observation and the result."""
     with real2sim.connect(site.url) as client, client.session(scene="tiny") as session:
         session.reset(
             action="control",
@@ -36,7 +37,7 @@ def recorded(site, tmp_path):
     return path, obs, session.result
 
 
-def test_a_recording_holds_the_episode_its_images_and_its_scores(recorded):
+def test_a_recording_contains_the_episode_images_and_scores(recorded):
     path, obs, result = recorded
     recording = load_recording(path)
     assert len(recording.instants) == 6
@@ -45,20 +46,20 @@ def test_a_recording_holds_the_episode_its_images_and_its_scores(recorded):
     assert [s.fields() for s in recording.rescore()] == [s.model_dump() for s in result.scores]
 
 
-def test_result_names_the_version_of_every_score(recorded):
+def test_the_result_names_the_version_of_every_score(recorded):
     _, _, result = recorded
     assert {s.name for s in result.scores} >= {"pdms", "nuplan_cls", "hugsim_hd", "neuroncap"}
     assert all(s.version for s in result.scores)
 
 
-def test_replay_scores_without_the_scene(recorded, tmp_path):
+def test_replay_computes_scores_without_the_scene(recorded, tmp_path):
     out = tmp_path / "out.json"
     done = runner.invoke(build_app(), ["replay", str(recorded[0]), "--json", str(out)])
     assert done.exit_code == 0, done.output
     assert json.loads(out.read_text())["steps"] == 5
 
 
-def test_replay_finds_the_same_bits_and_films_them(recorded, site, tmp_path):
+def test_replay_is_bit_identical_and_writes_a_video(recorded, site, tmp_path):
     out, video = tmp_path / "out.json", tmp_path / "drive.mp4"
     scene = site.worker.settings.scenes_path / "tiny.r2s"
     arguments = ["replay", str(recorded[0]), "--scene", str(scene), "--json", str(out)]
@@ -70,7 +71,7 @@ def test_replay_finds_the_same_bits_and_films_them(recorded, site, tmp_path):
     video_source.release()
 
 
-def test_episodes_of_scenarios_are_replayed_with_the_assets_they_show(site, tmp_path):
+def test_an_episode_on_a_scenario_is_replayed_with_its_assets(site, tmp_path):
     path, out = tmp_path / "drive.r2e", tmp_path / "out.json"
     with real2sim.connect(site.url) as client:
         client.assets.cut(scene="tiny", object_id="post", asset_id="replayed-post")
@@ -92,7 +93,7 @@ def test_episodes_of_scenarios_are_replayed_with_the_assets_they_show(site, tmp_
     assert json.loads(out.read_text())["bit_identical"] is True
 
 
-def test_replay_writes_mcap_that_holds_the_recording(recorded, tmp_path):
+def test_replay_exports_mcap_that_embeds_the_recording(recorded, tmp_path):
     path = tmp_path / "drive.mcap"
     done = runner.invoke(build_app(), ["replay", str(recorded[0]), "--mcap", str(path)])
     assert done.exit_code == 0, done.output

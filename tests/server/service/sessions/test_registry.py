@@ -1,4 +1,4 @@
-"""How many sessions there may be, how long they live, what is on record, what they weigh."""
+"""Number, lifetime, logs and memory of sessions."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def entries(site, info) -> list:
     return asyncio.run(site.worker.store.session_entries(info["session_id"]))
 
 
-def test_beyond_the_limit_creation_is_refused_with_a_time_to_come_back(own_site):
+def test_creation_over_the_limit_is_refused_with_retry_after(own_site):
     site = own_site(max_sessions=2)
     made = [site.create() for _ in range(2)]
     answer = site.http.post("/v1/sessions", params={"scene": "tiny"})
@@ -31,7 +31,7 @@ def test_beyond_the_limit_creation_is_refused_with_a_time_to_come_back(own_site)
     site.create()
 
 
-def test_a_worker_whose_sessions_are_all_taken_stays_ready_and_metrics_tell(own_site):
+def test_a_worker_at_its_session_limit_stays_ready(own_site):
     site = own_site(max_sessions=1)
     site.create()
     assert site.http.get("/readyz").status_code == 200
@@ -40,9 +40,7 @@ def test_a_worker_whose_sessions_are_all_taken_stays_ready_and_metrics_tell(own_
     assert "real2sim_session_limit 1.0" in metrics
 
 
-def test_sessions_that_nobody_uses_leave_the_memory_and_come_back_as_they_were(
-    own_site, join, manual_clock
-):
+def test_idle_sessions_are_evicted_and_restored_on_demand(own_site, join, manual_clock):
     site = own_site(session_idle_seconds=1.0)
     left, held = site.create(), site.create()
     with join(left) as planner:
@@ -58,7 +56,7 @@ def test_sessions_that_nobody_uses_leave_the_memory_and_come_back_as_they_were(
     assert stays.reset()["step"] == 0
 
 
-def test_sessions_of_an_earlier_run_are_rebuilt_when_they_are_asked_for(own_site, tmp_path):
+def test_sessions_of_an_earlier_run_are_rebuilt_on_demand(own_site, tmp_path):
     url = f"sqlite:///{tmp_path / 'store.db'}"
     before = own_site(store_url=url)
     info = before.create({"action": "control"})
@@ -71,7 +69,7 @@ def test_sessions_of_an_earlier_run_are_rebuilt_when_they_are_asked_for(own_site
     assert after.call("POST", info, "/step", json={}).json()["step"] == 6
 
 
-def test_an_action_of_before_an_upgrade_is_known_again_by_what_it_means(own_site, join, tmp_path):
+def test_a_repeated_action_is_recognised_after_an_upgrade(own_site, join, tmp_path):
     store = tmp_path / "store.db"
     before = own_site(store_url=f"sqlite:///{store}")
     info = before.create()
@@ -101,7 +99,7 @@ def test_the_workers_token_opens_every_session(own_site, join):
     assert join(info | {"token": "a-secret-token"}).reset()["step"] == 0
 
 
-def test_what_took_effect_is_on_record_in_order(site, join):
+def test_applied_messages_are_logged_in_order(site, join):
     info = site.create()
     planner = join(info)
     planner.reset(seed=4)
@@ -122,7 +120,7 @@ def test_what_took_effect_is_on_record_in_order(site, join):
     assert decode(log[2].payload)["operations"][0]["object_id"] == "post"
 
 
-def test_what_was_refused_or_repeated_is_not_on_record(site, join):
+def test_refused_and_repeated_messages_are_not_logged(site, join):
     info = site.create()
     planner = join(info)
     planner.reset(start_us=99_000_000)
@@ -137,7 +135,7 @@ def test_what_was_refused_or_repeated_is_not_on_record(site, join):
     assert [e.kind for e in entries(site, info)] == ["reset", "action"]
 
 
-def test_steps_by_request_are_on_record_one_by_one(site):
+def test_steps_by_request_are_logged_one_by_one(site):
     info = site.create({"action": "control", "dt_us": 10_000})
     plan = {"kind": "control", "acceleration": 0.0, "steering": 0.0}
     site.call("POST", info, "/step", json={"n": 45, "plan": plan})
@@ -162,7 +160,7 @@ def test_a_step_that_cannot_be_recorded_does_not_take_effect(site, join, monkeyp
 
 
 @pytest.mark.parametrize("codec", ["raw", "jpeg"])
-def test_a_step_that_cannot_be_shown_is_taken_off_the_record(site, join, monkeypatch, codec):
+def test_a_step_that_cannot_be_encoded_is_removed_from_the_log(site, join, monkeypatch, codec):
     info = site.create()
     planner = join(info)
     planner.reset(sensors=[CAMERA | {"codec": codec}])
@@ -178,7 +176,7 @@ def test_a_step_that_cannot_be_shown_is_taken_off_the_record(site, join, monkeyp
     assert [(e.seq, e.kind) for e in entries(site, info)] == [(0, "reset"), (1, "action")]
 
 
-def test_a_step_on_its_way_is_recorded_and_not_yet_among_the_entries(site, join, monkeypatch):
+def test_an_unfinished_step_is_logged_but_not_yet_visible(site, join, monkeypatch):
     info = site.create()
     planner = join(info)
     planner.reset(sensors=[CAMERA])
@@ -197,7 +195,7 @@ def test_a_step_on_its_way_is_recorded_and_not_yet_among_the_entries(site, join,
     assert seen == [["reset", "action"], ["reset"]]
 
 
-def test_ten_sessions_on_one_scene_are_light(site, join):
+def test_sessions_on_one_scene_need_less_than_5_mb_each(site, join):
     def driven() -> None:
         planner = join(site.create())
         planner.reset(sensors=[CAMERA | {"width": 640}], privileged=True)
@@ -212,7 +210,7 @@ def test_ten_sessions_on_one_scene_are_light(site, join):
         each = (tracemalloc.get_traced_memory()[0] - before) / 10
     finally:
         tracemalloc.stop()
-    # This counts the ten clients of this process too.
+    # Includes the ten clients in this process.
     assert each < 5e6
 
 

@@ -1,4 +1,4 @@
-"""Sessions by plain requests."""
+"""Sessions over REST."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ def problem(answer) -> tuple[int, str]:
     return answer.status_code, answer.json()["code"]
 
 
-# --- life -------------------------------------------------------------------------------------
+# --- lifetime -----------------------------------------------------------------------------------
 
 
-def test_a_session_names_its_worker_and_where_it_is(site):
+def test_a_session_id_starts_with_its_worker_and_urls_are_returned(site):
     answer = site.http.post("/v1/sessions", params={"scene": "tiny"})
     made = SessionInfo.model_validate_json(answer.content)
     site.made.append(answer.json())
@@ -42,11 +42,11 @@ def test_a_session_names_its_worker_and_where_it_is(site):
     assert (made.scene, made.step, made.controller) == ("tiny", None, False)
 
 
-def test_with_a_body_the_first_episode_begins_at_once(info):
+def test_a_creation_with_reset_starts_the_first_episode(info):
     assert (info["step"], info["t_us"], info["reset"]["dt_us"]) == (0, 0, 100_000)
 
 
-def test_a_session_on_a_scenario_begins_with_its_edits(site):
+def test_a_session_on_a_scenario_starts_with_its_edits(site):
     scenario = site.http.post("/v1/scenarios", json={"scene": "tiny"}).json()["scenario_id"]
     operations = {"operations": [{"op": "delete", "object_id": "car_red"}]}
     site.http.post(f"/v1/scenarios/{scenario}/operations", json=operations)
@@ -69,11 +69,11 @@ def test_a_session_on_a_scenario_begins_with_its_edits(site):
         ({"scenario": "sc_none"}, (404, "UNKNOWN_SCENARIO")),
     ],
 )
-def test_a_session_needs_one_world_that_exists(site, query, expected):
+def test_a_session_requires_exactly_one_existing_world(site, query, expected):
     assert problem(site.http.post("/v1/sessions", params=query)) == expected
 
 
-def test_a_session_whose_episode_cannot_begin_is_not_made(site):
+def test_a_session_with_an_invalid_first_episode_is_not_created(site):
     body = {"reset": {"start_us": 99_000_000}}
     answer = site.http.post("/v1/sessions", params={"scene": "tiny"}, json=body)
     assert problem(answer) == (422, "TIME_OUT_OF_RANGE")
@@ -81,20 +81,20 @@ def test_a_session_whose_episode_cannot_begin_is_not_made(site):
     assert site.worker.scene_cache._resident["tiny"].pins == 0
 
 
-def test_the_list_tells_no_tokens(site, info):
+def test_the_list_contains_no_tokens(site, info):
     (listed,) = site.http.get("/v1/sessions").json()["sessions"]
     assert (listed["session_id"], listed["token"]) == (info["session_id"], "")
 
 
 @pytest.mark.parametrize("token", ["guess", ""])
-def test_a_session_answers_only_to_its_token(site, info, token):
+def test_a_session_requires_its_token(site, info, token):
     headers = {"Authorization": f"Bearer {token}"} if token else {"Authorization": ""}
     answer = site.call("GET", info, "/state", headers=headers)
     assert problem(answer) == (401, "UNAUTHORIZED")
     assert answer.headers["WWW-Authenticate"] == "Bearer"
 
 
-def test_unknown_sessions_are_told_apart_from_closed_ones(site, info):
+def test_unknown_and_closed_sessions_get_different_errors(site, info):
     unknown = info | {"session_id": "w0.0000000000000000"}
     assert problem(site.call("GET", unknown)) == (404, "UNKNOWN_SESSION")
     assert site.call("DELETE", info).status_code == 204
@@ -102,13 +102,13 @@ def test_unknown_sessions_are_told_apart_from_closed_ones(site, info):
     assert problem(site.call("DELETE", info)) == (410, "SESSION_CLOSED")
 
 
-def test_a_deleted_session_gives_its_scene_back(site, info):
+def test_a_deleted_session_unpins_its_scene(site, info):
     assert site.worker.scene_cache._resident["tiny"].pins == 1
     site.call("DELETE", info)
     assert site.worker.scene_cache._resident["tiny"].pins == 0
 
 
-def test_the_same_creation_twice_makes_one_session(site):
+def test_a_creation_sent_twice_creates_one_session(site):
     headers = {"Idempotency-Key": "one-session"}
     answers = [
         site.http.post("/v1/sessions", params={"scene": "tiny"}, headers=headers) for _ in range(2)
@@ -122,11 +122,11 @@ def test_the_same_creation_twice_makes_one_session(site):
 # --- time -------------------------------------------------------------------------------------
 
 
-def test_steps_move_the_clock_under_one_plan(site, info):
+def test_steps_advance_the_clock_under_one_plan(site, info):
     answer = site.call("POST", info, "/step", json={"n": 3, "plan": CONTROL})
     state = SessionState.model_validate_json(answer.content)
     assert (state.step, state.t_us) == (3, 300_000)
-    # 1 m/s^2 for 0.3 s, behind the lag of engine and brakes of 0.2 s.
+    # 1 m/s^2 for 0.3 s, with the 0.2 s lag of engine and brakes.
     assert state.ego.speed == pytest.approx(5.3 - 0.2 * (1 - math.exp(-0.3 / 0.2)), abs=0.01)
 
 
@@ -135,7 +135,7 @@ def test_without_a_plan_the_ego_follows_the_log(site, info):
     assert state["ego"]["position"] == pytest.approx([5.0, 0.0, 0.0], abs=0.05)
 
 
-def test_many_steps_are_as_many_single_ones(site):
+def test_many_steps_equal_single_steps(site):
     one, other = site.create(RESET), site.create(RESET)
     at_once = site.call("POST", one, "/step", json={"n": 15, "plan": CONTROL}).json()
     site.call("POST", other, "/step", json={"plan": CONTROL})
@@ -145,7 +145,7 @@ def test_many_steps_are_as_many_single_ones(site):
     assert single["metrics"] == at_once["metrics"]
 
 
-def test_steps_end_with_the_episode_and_tell_what_happened(site):
+def test_steps_stop_at_the_end_of_the_episode(site):
     info = site.create(RESET | {"dt_us": 50_000})
     state = site.call("POST", info, "/step", json={"n": 1000}).json()
     assert (state["step"], state["truncated"], state["reason"]) == (40, True, "horizon")
@@ -153,7 +153,7 @@ def test_steps_end_with_the_episode_and_tell_what_happened(site):
     assert problem(site.call("POST", info, "/step", json={})) == (409, "EPISODE_OVER")
 
 
-def test_events_are_told_until_the_next_step_answer(site):
+def test_events_are_reported_once(site):
     info = site.create({"action": "pose", "on_collision": "continue"})
     plan = {"kind": "pose", "x": 12.0, "y": -3.0, "yaw": 0.0}
     first = site.call("POST", info, "/step", json={"plan": plan}).json()
@@ -162,7 +162,7 @@ def test_events_are_told_until_the_next_step_answer(site):
     assert again["events"] == []
 
 
-def test_reset_begins_anew(site, info):
+def test_reset_restores_the_initial_state(site, info):
     before = site.call("GET", info, "/state").json()
     site.call("POST", info, "/step", json={"n": 3, "plan": CONTROL})
     answer = site.call("POST", info, "/reset", json=RESET)
@@ -180,7 +180,7 @@ def test_reset_begins_anew(site, info):
         ({"plan": CONTROL | {"acceleration": "NaN"}}, (422, "INVALID_REQUEST")),
     ],
 )
-def test_a_step_that_is_refused_moves_nothing(site, info, body, expected):
+def test_a_refused_step_does_not_advance_the_clock(site, info, body, expected):
     assert problem(site.call("POST", info, "/step", json=body)) == expected
     assert site.call("GET", info, "/state").json()["step"] == 0
 
@@ -189,13 +189,13 @@ def test_a_step_that_is_refused_moves_nothing(site, info, body, expected):
     ("method", "path", "body"),
     [("GET", "/state", None), ("POST", "/step", {}), ("POST", "/render", {"sensors": [CAMERA]})],
 )
-def test_before_a_reset_there_is_nothing_to_see(site, method, path, body):
+def test_requests_before_a_reset_are_refused(site, method, path, body):
     answer = site.call(method, site.create(), path, json=body)
     assert problem(answer) == (409, "NOT_RESET")
 
 
 @pytest.mark.parametrize(("path", "body"), [("/step", {}), ("/reset", RESET)])
-def test_requests_keep_out_while_a_controller_is_connected(site, join, info, path, body):
+def test_requests_are_refused_while_a_controller_is_connected(site, join, info, path, body):
     planner = join(info)
     assert problem(site.call("POST", info, path, json=body)) == (409, "CONTROLLER_TAKEN")
     assert site.call("GET", info).json()["controller"]
@@ -203,7 +203,7 @@ def test_requests_keep_out_while_a_controller_is_connected(site, join, info, pat
     assert site.call("GET", info, "/state").json()["step"] == 1
 
 
-def test_a_controller_goes_on_where_requests_left_off(site, join, info):
+def test_a_controller_continues_after_steps_by_request(site, join, info):
     site.call("POST", info, "/step", json={"n": 2, "plan": CONTROL})
     planner = join(info, None)
     assert planner.hello()["step"] == 2
@@ -214,7 +214,7 @@ def test_a_controller_goes_on_where_requests_left_off(site, join, info):
 # --- render -----------------------------------------------------------------------------------
 
 
-def test_many_images_come_as_msgpack(site, info):
+def test_several_images_are_returned_as_msgpack(site, info):
     sensors = [{"camera": "front", "modalities": ["rgb", "depth"]}, {"camera": "left"}]
     answer = site.call("POST", info, "/render", json={"sensors": sensors})
     view = SERVER_MESSAGE.validate_python(decode(answer.content))
@@ -229,7 +229,7 @@ def test_many_images_come_as_msgpack(site, info):
 @pytest.mark.parametrize(
     ("media_type", "magic"), [("image/jpeg", b"\xff\xd8\xff"), ("image/png", b"\x89PNG")]
 )
-def test_one_image_comes_as_a_file(site, info, media_type, magic):
+def test_a_single_image_is_returned_as_a_file(site, info, media_type, magic):
     headers = {"Accept": media_type}
     answer = site.call("POST", info, "/render", json={"sensors": [CAMERA]}, headers=headers)
     assert answer.headers["Content-Type"] == media_type
@@ -237,13 +237,13 @@ def test_one_image_comes_as_a_file(site, info, media_type, magic):
     assert "render;dur=" in answer.headers["Server-Timing"]
 
 
-def test_several_images_are_no_file(site, info):
+def test_several_images_are_not_available_as_a_file(site, info):
     body = {"sensors": [CAMERA, {"camera": "left"}]}
     answer = site.call("POST", info, "/render", json=body, headers={"Accept": "image/png"})
     assert problem(answer) == (406, "NOT_ACCEPTABLE")
 
 
-def test_what_is_rendered_by_request_is_what_the_socket_shows(site, join, info):
+def test_a_render_by_request_equals_the_observation(site, join, info):
     answer = site.call("POST", info, "/render", json={"sensors": [CAMERA]}, headers=MSGPACK)
     rendered = decode(answer.content)["frames"][0]
     observed = join(info).reset(sensors=[CAMERA])["frames"][0]
@@ -261,7 +261,7 @@ ALL = ["rgb", "depth", "instance"]
         ({"camera": "front", "modalities": ["rgb", "rgb"]}, (422, "INVALID_REQUEST")),
     ],
 )
-def test_images_that_cannot_be_are_refused(site, info, sensor, expected):
+def test_invalid_sensors_are_refused(site, info, sensor, expected):
     answer = site.call("POST", info, "/render", json={"sensors": [sensor]}, headers=MSGPACK)
     assert problem(answer) == expected
 
@@ -279,7 +279,7 @@ def ids(answer) -> set[str]:
     return {a["object_id"] for a in answer.json()["agents"]}
 
 
-def test_an_author_spawns_a_car_beside_a_controller_and_takes_it_away(site, join):
+def test_rest_spawns_and_removes_a_car_while_a_controller_drives(site, join):
     info = site.create()
     planner = join(info)
     planner.reset(privileged=True)
@@ -294,7 +294,7 @@ def test_an_author_spawns_a_car_beside_a_controller_and_takes_it_away(site, join
     assert "spawned_1" not in {a["object_id"] for a in planner.act(1)["agents"]}
 
 
-def test_an_edit_of_a_running_world_takes_effect_once(site, info):
+def test_an_edit_of_a_running_world_sent_twice_takes_effect_once(site, info):
     key = {"Idempotency-Key": "one"}
     body = {"operations": [SPAWN]}
     answers = [site.call("POST", info, "/operations", json=body, headers=key) for _ in range(2)]
@@ -321,7 +321,7 @@ def test_a_refused_edit_of_a_running_world_changes_nothing(site, info, body, exp
     assert (state["revision"], len(state["agents"])) == (0, 3)
 
 
-def test_a_recording_holds_what_was_spawned(site, info):
+def test_a_recording_contains_spawned_objects(site, info):
     site.call("POST", info, "/operations", json={"operations": [SPAWN]})
     for _ in range(3):
         site.call("POST", info, "/step", json={"plan": CONTROL})

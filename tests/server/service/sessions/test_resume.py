@@ -1,4 +1,4 @@
-"""A lost connection, a worker that is killed: the episode goes on as if nothing had happened."""
+"""Episodes continue unchanged after a lost connection or a killed worker."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ SENSORS = [{"camera": "front", "modalities": ["rgb", "depth"], "codec": "raw"}]
 PLAN = {"kind": "control", "acceleration": 0.5, "steering": 0.02}
 
 
-# --- connections that are lost ----------------------------------------------------------------
+# --- lost connections ---------------------------------------------------------------------------
 
 
-def test_a_controller_comes_back_with_its_resume_token_and_takes_its_place(site, join):
+def test_a_resume_token_replaces_the_old_connection(site, join):
     info = site.create()
     first = join(info, None)
     token = first.hello()["resume_token"]
@@ -42,14 +42,14 @@ def test_a_controller_comes_back_with_its_resume_token_and_takes_its_place(site,
     assert first.wait_closed() == 1008
 
 
-def test_a_resume_token_needs_no_other(site, join):
+def test_a_resume_token_needs_no_session_token(site, join):
     info = site.create()
     token = join(info, None).hello()["resume_token"]
     answer = join(info, None).hello(token=None, resume={"token": token})
     assert answer["type"] == "welcome"
 
 
-def test_a_wrong_resume_token_displaces_nobody(site, join):
+def test_a_wrong_resume_token_does_not_displace_the_controller(site, join):
     info = site.create()
     planner = join(info)
     planner.reset()
@@ -58,7 +58,7 @@ def test_a_wrong_resume_token_displaces_nobody(site, join):
     assert planner.act(0)["step"] == 1
 
 
-def test_whoever_missed_an_observation_gets_it_again(site, join):
+def test_a_missed_observation_is_sent_again(site, join):
     info = site.create()
     first = join(info, None)
     token = first.hello()["resume_token"]
@@ -73,7 +73,7 @@ def test_whoever_missed_an_observation_gets_it_again(site, join):
     assert second.act(1)["step"] == 2
 
 
-def test_the_sdk_comes_back_by_itself(site):
+def test_the_sdk_reconnects_automatically(site):
     with (
         real2sim.connect(site.url) as client,
         client.session(scene="tiny") as session,
@@ -84,7 +84,7 @@ def test_the_sdk_comes_back_by_itself(site):
         assert session.step(PLAN).step == 2
 
 
-def test_an_observer_hears_what_the_controller_sees(site):
+def test_an_observer_receives_the_observations_of_the_controller(site):
     with real2sim.connect(site.url) as client, client.session(scene="tiny") as driver:
         driver.reset(action="control")
         with client.join(driver.session_id, token=driver.token, role="observer") as observer:
@@ -100,7 +100,7 @@ def test_an_observer_hears_what_the_controller_sees(site):
 # --- snapshots and forks ----------------------------------------------------------------------
 
 
-def test_a_snapshot_is_an_instant_to_return_to(site):
+def test_restoring_a_snapshot_repeats_the_episode(site):
     with real2sim.connect(site.url) as client, client.session(scene="tiny") as session:
         session.reset(action="control")
         session.step(PLAN)
@@ -111,7 +111,7 @@ def test_a_snapshot_is_an_instant_to_return_to(site):
     assert [o.ego for o in again] == [o.ego for o in first]
 
 
-def test_a_fork_goes_on_alike_and_on_its_own(site):
+def test_a_fork_starts_at_the_same_step_and_evolves_independently(site):
     with real2sim.connect(site.url) as client, client.session(scene="tiny") as session:
         session.reset(action="control", sensors=SENSORS)
         session.step(PLAN)
@@ -124,7 +124,7 @@ def test_a_fork_goes_on_alike_and_on_its_own(site):
     site.made.append({"session_id": forked.session_id, "token": forked.token})
 
 
-def test_a_fork_counts_as_a_session(own_site):
+def test_a_fork_counts_against_the_session_limit(own_site):
     site = own_site(max_sessions=1)
     with real2sim.connect(site.url) as client, client.session(scene="tiny") as session:
         session.reset(action="control")
@@ -140,7 +140,7 @@ def test_an_unknown_snapshot_is_refused(site):
             session.restore("there")
 
 
-# --- a worker that is killed ------------------------------------------------------------------
+# --- killed workers -----------------------------------------------------------------------------
 
 BEAMS = {"kind": "spinning", "elevation_deg": [-2, 0, 2], "columns": 90}
 FAN = {
@@ -162,14 +162,14 @@ def killable(tmp_path_factory, tiny_scene) -> Iterator[KillableWorker]:
 def drive(
     worker: KillableWorker, *, kill_at: tuple[int, ...] = (), delay: float = 0.0
 ) -> list[str]:
-    """Hashes of all observations of an episode with an edit in it.
+    """Hashes of all observations of an episode with an edit.
 
-    Kills come ``delay`` seconds after the episode has reached a step, whatever it does then.
+    The worker is killed ``delay`` seconds after the episode reaches a given step.
     """
-    warm_up_casting()  # on disk, so that no reset waits for it
+    warm_up_casting()  # cached on disk, so that no reset waits for it
     killers = ThreadPoolExecutor(1)
     with killers, real2sim.connect(worker.url) as client:
-        client.wait_ready(120)  # the kill before may have come after the last answer
+        client.wait_ready(120)  # the previous kill may have come after the last answer
         with client.session(scene="tiny", reconnect=240) as session:
             first = session.reset(
                 seed=5, sensors=SENSORS, lidars=[FAN], radars=["corner"], privileged=True
@@ -207,13 +207,13 @@ def undisturbed(killable) -> list[str]:
     return drive(killable)
 
 
-def test_after_kills_the_rest_of_the_episode_is_the_same(killable, undisturbed):
+def test_an_episode_is_identical_after_kills(killable, undisturbed):
     assert drive(killable, kill_at=(2, 9)) == undisturbed
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(2400)
-def test_after_fifty_kills_at_random_the_rest_is_the_same(killable, undisturbed):
+def test_an_episode_is_identical_after_fifty_random_kills(killable, undisturbed):
     chance = random.Random(7)
     for _ in range(50):
         kill_at = (chance.randrange(STEPS),)

@@ -1,4 +1,4 @@
-"""The client SDK against a worker as it is."""
+"""The client SDK against a real worker."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Cruise:
 """
 
 
-def test_an_agent_of_the_carla_leaderboard_drives(client, tmp_path):
+def test_a_carla_leaderboard_agent_drives(client, tmp_path):
     (tmp_path / "cruise.py").write_text(AGENT)
     planner = load_planner(f"carla={tmp_path / 'cruise.py'}")
     with client.session(scene="tiny") as session:
@@ -70,7 +70,7 @@ def test_an_agent_of_the_carla_leaderboard_drives(client, tmp_path):
     assert np.diff(route[:, 0]) == pytest.approx(1.0, abs=0.1)
 
 
-def test_edits_and_views_on_the_way(client):
+def test_edits_and_renders_during_a_drive(client):
     with client.session(scene="tiny") as session:
         session.reset(action="control", privileged=True)
         before = session.render(["front"])
@@ -87,7 +87,7 @@ def test_images_are_the_same_in_every_lossless_codec(client, codec):
         np.testing.assert_array_equal(view.image("front"), obs.image("front"))
 
 
-def test_a_session_without_a_socket(client):
+def test_a_session_is_stepped_and_rendered_without_a_socket(client):
     info = client.sessions.create(scene="tiny", action="control")
     plan = {"kind": "control", "acceleration": 0.0, "steering": 0.0}
     assert client.sessions.step(info.session_id, n=4, plan=plan).step == 4
@@ -99,7 +99,7 @@ def test_a_session_without_a_socket(client):
         client.sessions.get(info.session_id)
 
 
-def test_refusals_are_typed(client):
+def test_refusals_raise_typed_errors(client):
     info = client.sessions.create(scene="tiny")
     with client.join(info.session_id, token=info.token) as session:
         assert session.reset().step == 0
@@ -112,6 +112,6 @@ def test_refusals_are_typed(client):
     client.sessions.delete(info.session_id)
 
 
-def test_before_a_reset_the_sdk_says_so(client):
+def test_rendering_before_a_reset_raises_not_reset(client):
     with client.session(scene="tiny") as session, pytest.raises(real2sim.NotResetError):
         session.render(["front"])

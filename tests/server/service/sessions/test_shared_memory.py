@@ -1,4 +1,4 @@
-"""Images by memory that worker and controller share."""
+"""Images through shared memory between worker and controller."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def sent(frame: dict[str, Any]) -> np.ndarray:
 
 @pytest.fixture
 def attached(site, join):
-    """A controller that has attached: itself, and the memory."""
+    """An attached controller and its memory."""
     planner = join(site.create(), role=None)
     path = path_of(planner.hello())
     memory = mapped(path)
@@ -77,12 +77,10 @@ def raw_frame(height: int, width: int, modality: str = "rgb") -> EncodedFrame:
     return encode_frame(RenderedImage(sensor, modality, 0, np.eye(4), np.eye(3), pixels))
 
 
-# --- the wire -----------------------------------------------------------------------------------
+# --- protocol -----------------------------------------------------------------------------------
 
 
-def test_images_lie_in_the_slot_that_the_message_names_with_the_bits_of_the_socket(
-    attached, site, join
-):
+def test_images_in_a_slot_equal_those_sent_over_the_socket(attached, site, join):
     planner, memory = attached
     other = join(site.create())
     spec = {"action": "control", "sensors": SENSORS}
@@ -106,7 +104,7 @@ def test_images_lie_in_the_slot_that_the_message_names_with_the_bits_of_the_sock
             assert frame["T_world_sensor"].tobytes() == expected["T_world_sensor"].tobytes()
 
 
-def test_images_come_with_the_answer_where_no_slot_is_named_or_the_answer_was_given_before(
+def test_images_are_sent_inline_without_a_slot_or_for_a_repeated_answer(
     attached,
 ):
     planner, _ = attached
@@ -118,7 +116,7 @@ def test_images_come_with_the_answer_where_no_slot_is_named_or_the_answer_was_gi
     assert "offset" not in again["frames"][0]
 
 
-def test_an_image_that_is_no_raw_one_comes_with_the_answer(attached):
+def test_compressed_images_are_sent_inline(attached):
     planner, memory = attached
     sensors = [*SENSORS, {"camera": "left", "codec": "jpeg"}]
     frames = planner.ask("reset", spec={"sensors": sensors}, slot=0)["frames"]
@@ -127,13 +125,13 @@ def test_an_image_that_is_no_raw_one_comes_with_the_answer(attached):
     assert image_of(memory, frames[0]).any()
 
 
-def test_nobody_else_opens_the_file(site, join):
+def test_the_shared_file_is_readable_by_its_owner_only(site, join):
     path = path_of(join(site.create(), role=None).hello())
     assert stat.S_IMODE(path.stat().st_mode) == 0o400
     assert path.stat().st_uid == os.geteuid()
 
 
-def test_only_the_controller_learns_the_name(attached, site, join):
+def test_only_the_controller_can_attach(attached, site, join):
     planner, _ = attached
     observer = join(planner.info, role=None)
     assert "shared_memory" not in observer.hello(role="observer")
@@ -143,7 +141,7 @@ def test_only_the_controller_learns_the_name(attached, site, join):
     assert "offset" not in observer.receive()["frames"][0]
 
 
-def test_a_wrong_secret_is_refused_and_the_session_goes_on_over_the_socket(site, join):
+def test_after_a_wrong_secret_images_go_over_the_socket(site, join):
     planner = join(site.create(), role=None)
     path = path_of(planner.hello())
     assert planner.ask("attach", secret=bytes(SHM_SECRET_BYTES))["code"] == "INVALID_REQUEST"
@@ -153,7 +151,7 @@ def test_a_wrong_secret_is_refused_and_the_session_goes_on_over_the_socket(site,
     assert planner.ask("attach", secret=bytes(SHM_SECRET_BYTES))["code"] == "INVALID_REQUEST"
 
 
-def test_a_client_that_does_not_attach_declines(site, join):
+def test_the_file_is_removed_if_the_client_does_not_attach(site, join):
     planner = join(site.create(), role=None)
     path = path_of(planner.hello())
     assert path.exists()
@@ -161,7 +159,7 @@ def test_a_client_that_does_not_attach_declines(site, join):
     assert not path.exists()
 
 
-def test_a_slot_that_is_none_is_refused_and_nothing_moves(attached):
+def test_an_invalid_slot_is_refused_without_advancing_the_step(attached):
     planner, _ = attached
     planner.reset(sensors=SENSORS)
     refused = planner.ask("action", step=0, plan=CONTROL, slot=SLOTS)
@@ -169,7 +167,7 @@ def test_a_slot_that_is_none_is_refused_and_nothing_moves(attached):
     assert planner.act(0)["step"] == 1
 
 
-def test_memory_is_counted_and_free_once_the_client_is_gone(attached, site):
+def test_memory_is_counted_and_freed_on_disconnect(attached, site):
     planner, _ = attached
     segments = site.worker.sessions.segments
     planner.ask("reset", spec={"sensors": SENSORS}, slot=0)
@@ -193,7 +191,7 @@ def driven(session, steps: int) -> list[real2sim.Observation]:
     return observations
 
 
-def test_the_sdk_chooses_it_by_itself_and_images_that_are_kept_stay_as_they_were(client):
+def test_the_sdk_uses_shared_memory_and_kept_images_do_not_change(client):
     with client.session(scene="tiny") as session:
         assert session.shared_memory
         kept = driven(session, SLOTS + 3)
@@ -210,7 +208,7 @@ def test_the_sdk_chooses_it_by_itself_and_images_that_are_kept_stay_as_they_were
             assert (frame.data, frame.array.dtype) == (plain.data, plain.array.dtype)
 
 
-def test_slots_come_back_with_the_last_view_of_an_image(client):
+def test_slots_are_reused_when_the_last_view_is_released(client):
     with client.session(scene="tiny") as session:
         part = driven(session, 1)[0].image("front")[8:]
         before = part.copy()
@@ -220,7 +218,7 @@ def test_slots_come_back_with_the_last_view_of_an_image(client):
         np.testing.assert_array_equal(part, before)
 
 
-def test_who_must_have_it_is_told_why_there_is_none(client, site, monkeypatch):
+def test_requiring_shared_memory_fails_with_the_reason_if_unavailable(client, site, monkeypatch):
     monkeypatch.setattr(site.worker.sessions, "segments", Segments(MemoryBudget(1), 0))
     with client.session(scene="tiny") as session:
         assert not session.shared_memory
@@ -251,16 +249,16 @@ def segments():
         one.close()
 
 
-def test_images_over_the_budget_or_the_slot_go_over_the_socket(segments):
+def test_images_over_the_budget_or_the_slot_size_are_not_placed(segments):
     segment = segments()
     assert segment.place(0, [raw_frame(300, 1000)]) is not None
-    assert segment.place(1, [raw_frame(300, 1000)]) is None  # of the budget
-    assert segment.place(0, [raw_frame(400, 1000)]) is None  # of the slot
+    assert segment.place(1, [raw_frame(300, 1000)]) is None  # over the budget
+    assert segment.place(0, [raw_frame(400, 1000)]) is None  # over the slot size
     assert segment.place(0, [raw_frame(300, 1000)]) is not None
     assert 900_000 <= segment.taken_bytes < 1_000_000
 
 
-def test_a_machine_without_memory_left_sends_over_the_socket(segments, monkeypatch):
+def test_images_are_not_placed_if_the_machine_is_out_of_memory(segments, monkeypatch):
     segment = segments()
 
     def full(*_: int) -> None:
@@ -272,7 +270,7 @@ def test_a_machine_without_memory_left_sends_over_the_socket(segments, monkeypat
     assert Segments(MemoryBudget(1), 4 << 20).create() is None
 
 
-def test_names_that_killed_workers_left_are_swept_and_no_others(segments):
+def test_only_segments_of_killed_workers_are_removed(segments):
     path = Path(SHM_FOLDER, segments().offer["name"])
     left = path.with_name(f"real2sim-{os.urandom(16).hex()}")
     foreign = path.with_name(f"real2sim-{os.urandom(4).hex()}.txt")
@@ -288,7 +286,7 @@ def test_names_that_killed_workers_left_are_swept_and_no_others(segments):
 # --- sizes --------------------------------------------------------------------------------------
 
 
-def test_five_large_cameras_with_all_images_fit_a_message_and_a_slot(site):
+def test_five_full_hd_cameras_with_all_modalities_fit_a_message_and_a_slot(site):
     info = site.create()
     scene = site.session(info).start.scene
     sensor = SensorSpec(camera="front", width=1920, modalities=MODALITIES, codec="raw")

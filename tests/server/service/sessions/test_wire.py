@@ -1,4 +1,4 @@
-"""Messages joined from parts are the messages that the codec knows."""
+"""Messages assembled from parts equal those of the codec."""
 
 from __future__ import annotations
 
@@ -46,12 +46,12 @@ def view(frames: int, codec: str = "raw") -> bytes:
 
 
 @given(st.integers(min_value=0, max_value=2**53))
-def test_the_id_of_a_message_is_filled_in_last(message_id):
+def test_the_message_id_is_set_when_joining(message_id):
     assert decode(pack_message("progress", {"phase": "x"}).joined(message_id))["id"] == message_id
 
 
 @pytest.mark.parametrize("members", [0, 1, 12, 13, 14, 40])
-def test_maps_of_any_size_are_joined(members):
+def test_maps_of_any_size_are_encoded(members):
     fields = {f"f{i}": i for i in range(members)}
     message = decode(pack_message("error", fields).joined(1))
     assert message == {"v": 1, "type": "error", "id": 1, **fields}
@@ -65,7 +65,7 @@ def test_any_number_of_frames_makes_a_valid_message(frames):
 
 
 @pytest.mark.parametrize("modality", get_args(Modality))
-def test_raw_pixels_arrive_as_they_were(modality):
+def test_raw_pixels_are_unchanged(modality):
     drawn = image("raw", modality)
     frame = encode_frame(drawn)
     pixels = np.frombuffer(frame.data, frame.header.fields["dtype"]).reshape(
@@ -74,16 +74,16 @@ def test_raw_pixels_arrive_as_they_were(modality):
     np.testing.assert_array_equal(pixels, drawn.pixels)
 
 
-def test_raw_pixels_are_not_copied_before_they_are_joined():
+def test_raw_pixels_are_not_copied_before_joining():
     drawn = image("raw")
     assert np.shares_memory(np.asarray(encode_frame(drawn).data), drawn.pixels)
 
 
-def test_depth_asked_for_as_jpeg_is_png():
+def test_jpeg_depth_is_sent_as_png():
     assert encode_frame(image("jpeg", "depth")).codec == "png"
 
 
-def test_stages_are_measured_and_sent():
+def test_pack_time_is_measured_and_sent():
     timing = decode(view(1))["timing"]
     assert set(timing) == {"pack"}
     assert timing["pack"] >= 0

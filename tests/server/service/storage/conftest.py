@@ -12,7 +12,7 @@ def sqlite_url(tmp_path) -> str:
 
 @pytest.fixture(params=["sqlite", "postgresql"])
 def url(request, sqlite_url) -> str:
-    """An empty database of each kind; what holds for one holds for the other."""
+    """URL of an empty database of each kind."""
     if request.param == "sqlite":
         return sqlite_url
     server: Postgres = request.getfixturevalue("postgres")

@@ -1,4 +1,5 @@
-"""What an entry of a session's log costs on PostgreSQL: prepared, and by SQLAlchemy's transactions.
+"""Cost of appending to a session log on PostgreSQL: prepared statement versus SQLAlchemy
+transaction.
 
 ``PYTHONPATH=. python -m tests.server.service.storage.measure_appends``
 """
@@ -20,7 +21,7 @@ SESSION = SessionRow("w0.1", "w0", "tiny", "0" * 64, None, None, "secret", 1)
 
 
 async def measure(url: str) -> None:
-    """Print the figures of both ways, twice."""
+    """Print the timings of both, twice."""
     for turn, way in enumerate(("prepared", "sqlalchemy") * 2):
         store = Store(url)
         await store.open()

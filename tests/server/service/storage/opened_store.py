@@ -1,4 +1,4 @@
-"""A store, opened for a piece of work."""
+"""Run code with an open store."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ T = TypeVar("T")
 
 
 def run(url: str, work: Callable[[Store], Awaitable[T]], **options: Any) -> T:
-    """Run ``work(store)`` on a store opened for it, with options of its own."""
+    """Run ``work(store)`` with a store opened with these options."""
 
     async def inside() -> T:
         store = Store(url, **options)

@@ -1,5 +1,5 @@
-"""Sessions go to another worker once theirs has not kept its promise, and never before; whoever had
-one before can write nothing more."""
+"""A session moves to another worker only after its lease has expired. The previous worker can then
+no longer write to it."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ async def taken_over(store: Store) -> SessionRow:
     return row
 
 
-def test_nobody_takes_a_session_from_a_worker_that_is_alive(url):
+def test_a_session_with_a_valid_lease_is_not_taken_over(url):
     async def work(store):
         await store.create_session(SESSION)
         await leases_of(store, "w0").renew({})
@@ -54,7 +54,7 @@ def test_nobody_takes_a_session_from_a_worker_that_is_alive(url):
     assert row == SESSION
 
 
-def test_a_session_goes_to_whoever_asks_once_the_promise_has_run_out(url):
+def test_a_session_with_an_expired_lease_is_taken_over_once(url):
     async def work(store):
         await store.create_session(SESSION)
         await leases_of(store, "w0", OVER_S).renew({})
@@ -67,7 +67,7 @@ def test_a_session_goes_to_whoever_asks_once_the_promise_has_run_out(url):
     assert two is None
 
 
-def test_a_promise_that_is_given_up_holds_nobody_up(url):
+def test_a_released_lease_allows_a_takeover(url):
     async def work(store):
         await store.create_session(SESSION)
         await leases_of(store, "w0").renew({})
@@ -77,7 +77,7 @@ def test_a_promise_that_is_given_up_holds_nobody_up(url):
     assert run(url, work).worker_id == "w1"
 
 
-def test_its_own_worker_may_always_claim_a_session_anew(url):
+def test_a_worker_can_always_reclaim_its_own_session(url):
     async def work(store):
         await store.create_session(SESSION)
         await leases_of(store, "w0").renew({})
@@ -86,7 +86,7 @@ def test_its_own_worker_may_always_claim_a_session_anew(url):
     assert run(url, work) == replace(SESSION, epoch=1)
 
 
-def test_a_session_that_is_over_or_unknown_is_not_taken_over(url):
+def test_closed_and_unknown_sessions_are_not_taken_over(url):
     async def work(store):
         await store.create_session(SESSION)
         await store.close_session(SESSION.claim, reason="done")
@@ -96,7 +96,7 @@ def test_a_session_that_is_over_or_unknown_is_not_taken_over(url):
     assert run(url, work) == (None, None)
 
 
-def test_who_had_a_session_before_appends_nothing(url):
+def test_the_previous_worker_cannot_append(url):
     reply = StoredReply("key", "f" * 64, 200, {}, b"{}")
 
     async def work(store):
@@ -114,7 +114,7 @@ def test_who_had_a_session_before_appends_nothing(url):
     assert trouble is None
 
 
-def test_who_had_a_session_before_withdraws_and_ends_nothing(url):
+def test_the_previous_worker_cannot_withdraw_or_close(url):
     async def work(store):
         row = await taken_over(store)
         with pytest.raises(FencedError):
@@ -128,7 +128,7 @@ def test_who_had_a_session_before_withdraws_and_ends_nothing(url):
 
 
 @pytest.mark.parametrize("count", [1, 40])
-def test_of_logs_written_together_none_is_where_one_is_taken_over(url, count):
+def test_logs_written_together_are_all_refused_if_one_was_taken_over(url, count):
     other = replace(SESSION, session_id="w0.2")
 
     async def work(store):
@@ -143,9 +143,9 @@ def test_of_logs_written_together_none_is_where_one_is_taken_over(url, count):
     assert run(url, work) == []
 
 
-def test_an_append_under_way_and_a_takeover_see_each_other(postgres):
-    """On a server both may run at once: either the entry is in the log that is taken over, or it is
-    refused."""
+def test_a_concurrent_append_and_takeover_exclude_each_other(postgres):
+    """With a database server both can run at once. Either the entry is in the log that is taken
+    over, or it is refused."""
     url = postgres.new_database()
 
     async def work(store):
@@ -171,7 +171,7 @@ def test_an_append_under_way_and_a_takeover_see_each_other(postgres):
     assert run(url, work, timeout_s=LIMIT_S) == []
 
 
-def test_epochs_are_told_of_own_sessions_alone(url):
+def test_epochs_are_returned_for_own_sessions_only(url):
     async def work(store):
         await taken_over(store)
         await store.create_session(replace(SESSION, session_id="w0.2"))
@@ -181,7 +181,7 @@ def test_epochs_are_told_of_own_sessions_alone(url):
     assert run(url, work) == ({"w0.2": 0}, {"w0.1": 1})
 
 
-def test_the_fleet_is_told_who_lives_and_what_they_say(url):
+def test_workers_lists_liveness_and_documents(url):
     async def work(store):
         await leases_of(store, "w0").renew({"sessions": 2})
         await leases_of(store, "w0").renew({"sessions": 3})
@@ -194,7 +194,7 @@ def test_the_fleet_is_told_who_lives_and_what_they_say(url):
     assert (two.worker_id, two.alive) == ("w1", False)
 
 
-def test_a_statement_that_changes_fewer_rows_than_it_must_takes_all_back(url):
+def test_a_write_that_changes_too_few_rows_is_rolled_back(url):
     async def work(store):
         await store.create_session(SESSION)
         rename = sa.text("UPDATE sessions SET scene = 'other'")

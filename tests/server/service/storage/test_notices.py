@@ -1,4 +1,4 @@
-"""Word between workers by PostgreSQL, and what is left where there is none."""
+"""Notices between workers over PostgreSQL, and the fallback on SQLite."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ def server_url(postgres) -> str:
     return postgres.new_database()
 
 
-def test_who_waits_hears_of_a_change_at_once(server_url):
+def test_a_waiting_listener_is_notified_of_a_change_immediately(server_url):
     async def work(store: Store) -> Counter[str]:
         notices = Notices(server_url, timeout_s=LIMIT_S)
         async with notices.running():
             jobs, bundles = notices.listener("jobs"), notices.listener("bundles")
-            await asyncio.gather(jobs(LIMIT_S), bundles(LIMIT_S))  # that it listens now
+            await asyncio.gather(jobs(LIMIT_S), bundles(LIMIT_S))  # wait until it listens
             before = notices._counts.copy()
             waiting = asyncio.create_task(jobs(LIMIT_S))
             await store.write(*notice("jobs", on_server=True))
@@ -35,7 +35,7 @@ def test_who_waits_hears_of_a_change_at_once(server_url):
     assert run(server_url, work) == {"jobs": 1}
 
 
-def test_a_change_that_is_taken_back_is_not_told(server_url):
+def test_a_rolled_back_change_is_not_announced(server_url):
     async def work(store: Store) -> Counter[str]:
         notices = Notices(server_url, timeout_s=LIMIT_S)
         async with notices.running():
@@ -45,7 +45,7 @@ def test_a_change_that_is_taken_back_is_not_told(server_url):
             failing = module.Write("SELECT 1/0")
             with pytest.raises(Exception, match="division by zero"):
                 await store.write(*notice("jobs", on_server=True), failing)
-            # Word comes in the order of the changes.
+            # Notices arrive in the order of the changes.
             await store.write(*notice("bundles", on_server=True))
             await bundles(LIMIT_S)
             return notices._counts - before
@@ -53,7 +53,7 @@ def test_a_change_that_is_taken_back_is_not_told(server_url):
     assert run(server_url, work) == {"bundles": 1}
 
 
-def test_word_is_heard_again_after_the_server_was_gone(postgres, monkeypatch):
+def test_notices_resume_after_a_server_restart(postgres, monkeypatch):
     monkeypatch.setattr(module, "RETRY_S", 0.05)
     monkeypatch.setattr(module, "BEAT_S", 0.05)
 
@@ -64,13 +64,13 @@ def test_word_is_heard_again_after_the_server_was_gone(postgres, monkeypatch):
             before = notices._counts["jobs"]
             await asyncio.to_thread(postgres.stop)
             await asyncio.to_thread(postgres.start)
-            # It may have missed something: it looks.
+            # A notice may have been missed, so the listener wakes up.
             await wait_until_async(lambda: notices._counts["jobs"] > before, "word")
 
     asyncio.run(work())
 
 
-def test_a_file_has_no_word_and_waiting_ends_by_itself(tmp_path):
+def test_sqlite_has_no_notices_and_waiting_times_out(tmp_path):
     async def work() -> None:
         notices = Notices(f"sqlite:///{tmp_path / 'x.db'}", timeout_s=5)
         assert not notices.can_hear

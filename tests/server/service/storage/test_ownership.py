@@ -1,4 +1,4 @@
-"""One worker on a state folder, and one of a name on a store."""
+"""Exclusive ownership of state folders and worker names."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ HOLD = (
 )
 
 
-def test_a_second_worker_on_a_state_folder_is_refused_with_the_process_that_has_it(tmp_path):
+def test_a_second_worker_on_a_state_folder_is_refused_with_the_owner_pid(tmp_path):
     command = [sys.executable, "-c", HOLD, str(tmp_path)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as first:
         try:
@@ -38,11 +38,11 @@ def test_a_second_worker_on_a_state_folder_is_refused_with_the_process_that_has_
             assert "--data" in str(refused.value)
         finally:
             first.kill()
-    # However a process ends, its folder is free.
+    # The folder is free again, however the process ended.
     check_state_folder(tmp_path)
 
 
-def test_a_worker_on_a_taken_folder_is_refused_before_anything_is_loaded(make_settings, tmp_path):
+def test_a_worker_on_an_owned_folder_is_refused_at_the_start_check(make_settings, tmp_path):
     with (
         owned_folder(tmp_path / "data"),
         pytest.raises(StateFolderError, match=f"process {os.getpid()}"),
@@ -50,7 +50,7 @@ def test_a_worker_on_a_taken_folder_is_refused_before_anything_is_loaded(make_se
         check_start(make_settings())
 
 
-def test_a_worker_on_a_taken_folder_marks_no_jobs(run_worker, held_videos):
+def test_a_refused_worker_does_not_interrupt_jobs(run_worker, held_videos):
     with run_worker() as client:
         body = {"scene": "tiny", "camera": "front", "fps": 1}
         job = client.post("/v1/exports", json=body).headers["Location"]
@@ -61,7 +61,7 @@ def test_a_worker_on_a_taken_folder_marks_no_jobs(run_worker, held_videos):
 
 
 @pytest.mark.parametrize("kind", ["sqlite", "postgresql"])
-def test_a_name_is_given_once_on_a_shared_store(kind, request, run_worker, tmp_path):
+def test_a_worker_name_is_unique_on_a_shared_store(kind, request, run_worker, tmp_path):
     url = f"sqlite:///{tmp_path / 'shared.db'}"
     if kind == "postgresql":
         url = request.getfixturevalue("postgres").new_database()
@@ -80,7 +80,7 @@ def test_a_name_is_given_once_on_a_shared_store(kind, request, run_worker, tmp_p
 
 @contextlib.contextmanager
 def unprivileged() -> Iterator[None]:
-    """Root may write everywhere, and is somebody else for the length of the block."""
+    """Drop root privileges inside the block, because root can write everywhere."""
     if os.getuid() != 0:
         yield
         return
@@ -91,7 +91,7 @@ def unprivileged() -> Iterator[None]:
         os.seteuid(0)
 
 
-def test_a_folder_that_cannot_be_written_to_is_refused_with_the_remedy(tmp_path):
+def test_an_unwritable_folder_is_refused_with_a_hint(tmp_path):
     closed = tmp_path / "closed"
     closed.mkdir(mode=0o555)
     with unprivileged(), pytest.raises(StateFolderError, match="cannot be written to") as refused:

@@ -1,4 +1,4 @@
-"""What a store lets go of by itself, and what it never does."""
+"""Data that a store deletes automatically, and data that it keeps."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def url(request, tmp_path) -> str:
 
 
 async def add(store, session_id, *, days_ago, ended=False, steps=3, payload=b"x") -> None:
-    """A session that was last used, and has ended or not, so many days ago."""
+    """Add a session last used some days ago, ended or still open."""
     us = now_us() - round(days_ago * DAY_US)
     entries = [SessionEntry(k, "action", k, payload, us) for k in range(steps)]
     row = replace(SESSION, session_id=session_id, created_us=us - DAY_US)
@@ -45,7 +45,7 @@ async def add(store, session_id, *, days_ago, ended=False, steps=3, payload=b"x"
 
 
 async def kept(store) -> dict[str, bool]:
-    """Sessions that there are, and whether they are open."""
+    """Remaining sessions, and whether they are open."""
     rows = await store.read(sa.select(schema.sessions))
     return {row["session_id"]: row["closed_us"] is None for row in rows}
 
@@ -55,7 +55,7 @@ def tidy(store, *, days=30.0, max_bytes=GIB, in_use=()):
     return Retention(store, limits, worker_id="w0").tidy(in_use=in_use)
 
 
-def test_ended_sessions_go_with_their_logs_after_their_time(url, monkeypatch):
+def test_old_ended_sessions_are_deleted_with_their_logs(url, monkeypatch):
     monkeypatch.setattr(module, "PIECE_ROWS", 10)
 
     async def work(store):
@@ -67,7 +67,7 @@ def test_ended_sessions_go_with_their_logs_after_their_time(url, monkeypatch):
     assert run(url, work) == (1, {"w0.new": False}, 0)
 
 
-def test_sessions_that_nobody_uses_are_ended_and_others_are_not(url):
+def test_only_unused_sessions_are_ended(url):
     async def work(store):
         await add(store, "w0.forgotten", days_ago=31)
         await add(store, "w0.held", days_ago=31)
@@ -79,7 +79,7 @@ def test_sessions_that_nobody_uses_are_ended_and_others_are_not(url):
     assert run(url, work) == expected
 
 
-def test_above_its_size_a_store_lets_the_oldest_ended_sessions_go(url):
+def test_over_its_size_limit_a_store_deletes_the_oldest_ended_sessions(url):
     async def work(store):
         for n in range(20):
             payload = bytes(10_000)
@@ -96,7 +96,7 @@ def test_above_its_size_a_store_lets_the_oldest_ended_sessions_go(url):
     assert "w0.00" not in left
 
 
-def test_scenarios_stay_whatever_they_take(url):
+def test_scenarios_are_never_deleted(url):
     async def work(store):
         await store.create_scenario(ScenarioRow("sc_1", "n", "tiny", "0" * 64, 1))
         store.record_revision("sc_1", 1, {"kind": "edit", "x": "y" * 100_000}, created_us=1)
@@ -106,7 +106,7 @@ def test_scenarios_stay_whatever_they_take(url):
     assert len(run(url, work)) == 1
 
 
-def test_what_went_is_given_back_to_the_disk(tmp_path):
+def test_freed_pages_are_returned_to_the_file_system(tmp_path):
     file = tmp_path / "store.db"
     url = f"sqlite:///{file}"
     log = {"steps": 200, "payload": bytes(10_000)}
@@ -117,7 +117,7 @@ def test_what_went_is_given_back_to_the_disk(tmp_path):
     assert file.stat().st_size < before / 4
 
 
-def test_as_many_pages_are_given_back_at_once_as_asked_for(tmp_path):
+def test_only_the_requested_number_of_pages_is_released_at_once(tmp_path):
     async def work(store):
         await add(store, "w0.old", days_ago=31, ended=True, steps=200, payload=bytes(10_000))
         everything = sa.delete(schema.session_log)
@@ -140,8 +140,8 @@ async def _free_pages(store) -> int:
 
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
-def test_a_week_of_work_stays_within_the_limit(tmp_path):
-    """A million steps, 100,000 edits, 1,000 sessions."""
+def test_a_week_of_work_stays_within_the_size_limit(tmp_path):
+    """One million steps, 100,000 edits and 1,000 sessions."""
     url, limit = f"sqlite:///{tmp_path / 'store.db'}", 200 * 1024**2
     entry = {"kind": "edit", "operations": [{"op": "translate", "object_id": "post", "x": 1.0}]}
 

@@ -1,4 +1,4 @@
-"""The schema of a new store, and the migration of an older one."""
+"""Creation and migration of the database schema."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def schema_of(url: str) -> dict[str, object]:
     return found
 
 
-def test_the_newest_revision_has_the_number_of_the_schema():
+def test_revisions_are_numbered_up_to_the_schema_version():
     assert [number for number, _ in schema._revisions()] == [*range(1, schema.SCHEMA_VERSION + 1)]
 
 
@@ -63,7 +63,7 @@ def upgrade() -> None:
 
 @pytest.fixture
 def next_version(tmp_path, monkeypatch):
-    """Adds one revision to this program; ``then`` is a further statement of it."""
+    """Add a schema revision. ``then`` is another statement of it."""
 
     def make(then: str = "pass") -> int:
         last = schema.SCHEMA_VERSION
@@ -78,7 +78,7 @@ def next_version(tmp_path, monkeypatch):
     return make
 
 
-def test_a_store_is_migrated_by_the_revisions_of_alembic(url, next_version):
+def test_a_store_is_migrated_by_alembic_revisions(url, next_version):
     run(url, nothing)
     new = next_version()
     engine = connect(url, timeout_s=30)
@@ -89,7 +89,7 @@ def test_a_store_is_migrated_by_the_revisions_of_alembic(url, next_version):
     assert "colour" in str(schema_of(url)["scenarios"])
 
 
-def test_a_revision_that_fails_leaves_the_store_as_it_was(url, next_version):
+def test_a_failed_revision_leaves_the_store_unchanged(url, next_version):
     run(url, nothing)
     before = schema_of(url)
     next_version("raise OSError('the plug was pulled')")
@@ -98,9 +98,7 @@ def test_a_revision_that_fails_leaves_the_store_as_it_was(url, next_version):
     assert schema_of(url) == before
 
 
-def test_an_older_store_is_refused_with_the_command_to_run_where_that_is_asked_for(
-    url, next_version
-):
+def test_migration_refuse_rejects_an_older_store_with_the_command(url, next_version):
     run(url, nothing)
     before = schema_of(url)
     next_version()
@@ -111,12 +109,12 @@ def test_an_older_store_is_refused_with_the_command_to_run_where_that_is_asked_f
     run(url, nothing, migration="refuse")
 
 
-def test_a_new_store_is_made_also_where_older_ones_are_refused(url):
+def test_migration_refuse_still_creates_a_new_store(url):
     run(url, nothing, migration="refuse")
     assert "alembic_version" in schema_of(url)
 
 
-def test_a_store_from_before_the_first_release_is_refused_and_not_changed(url):
+def test_a_store_from_before_the_first_release_is_refused_and_unchanged(url):
     engine = sa.create_engine(url)
     with engine.begin() as connection:
         for statement in (
@@ -132,7 +130,7 @@ def test_a_store_from_before_the_first_release_is_refused_and_not_changed(url):
     assert schema_of(url) == before
 
 
-def test_workers_that_start_at_once_on_one_database_all_come_up(url):
+def test_concurrent_workers_all_start_on_a_new_database(url):
     errors: list[BaseException] = []
     together = threading.Barrier(4)
 
@@ -155,7 +153,7 @@ def test_workers_that_start_at_once_on_one_database_all_come_up(url):
 
 
 class Locked:
-    """A cursor whose database another connection holds for a while."""
+    """A cursor whose database is locked by another connection for a while."""
 
     def __init__(self, times: int, code: int = sqlite3.SQLITE_BUSY) -> None:
         self.left, self.code = times, code
@@ -168,19 +166,19 @@ class Locked:
             raise error
 
 
-def test_who_finds_the_journal_changed_by_another_connection_tries_again():
+def test_setting_the_journal_mode_is_retried_while_the_database_is_locked():
     cursor = Locked(3)
     keep_write_ahead_journal(cursor, 30)
     assert cursor.left == -1
 
 
 @pytest.mark.parametrize(("cursor", "timeout_s"), [(Locked(9**9), 0.0), (Locked(1, 8), 30)])
-def test_a_journal_that_cannot_be_changed_is_told(cursor, timeout_s):
+def test_failing_to_set_the_journal_mode_raises(cursor, timeout_s):
     with pytest.raises(sqlite3.OperationalError):
         keep_write_ahead_journal(cursor, timeout_s)
 
 
-def test_the_files_of_a_store_are_for_its_owner_alone(tmp_path):
+def test_store_files_are_readable_by_their_owner_only(tmp_path):
     file = tmp_path / "store.db"
     sqlite3.connect(file).close()
     file.touch(0o644)

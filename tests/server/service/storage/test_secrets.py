@@ -1,4 +1,4 @@
-"""No secret of a session can be read from what a worker keeps."""
+"""Session secrets cannot be read from a worker's files."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from real2sim_server.service.accounts import sealed, unsealed
 
 @pytest.fixture
 def created(start_worker):
-    """A worker, and the answer to the creation of a session under a key."""
+    """A worker, and the answer to a session creation with an idempotency key."""
     client = start_worker()
     headers = {"Idempotency-Key": "made-once"}
     answer = client.post("/v1/sessions?scene=tiny", json={}, headers=headers)
@@ -22,14 +22,14 @@ def created(start_worker):
     return client, answer.json()
 
 
-def test_the_token_of_a_session_is_in_no_file_of_the_worker(created, tmp_path):
+def test_a_session_token_is_in_no_file_of_the_worker(created, tmp_path):
     _, info = created
     for file in (tmp_path / "data").rglob("*"):
         if file.is_file():
             assert info["token"].encode() not in file.read_bytes(), file.name
 
 
-def test_the_token_of_a_session_opens_it_and_its_hash_does_not(created, tmp_path):
+def test_a_session_accepts_its_token_but_not_the_stored_hash(created, tmp_path):
     client, info = created
     with sqlite3.connect(tmp_path / "data" / "real2sim.db") as connection:
         ((kept,),) = connection.execute("SELECT token_hash FROM sessions").fetchall()
@@ -39,12 +39,12 @@ def test_the_token_of_a_session_opens_it_and_its_hash_does_not(created, tmp_path
         assert client.get(url, headers=headers).status_code == status
 
 
-def test_files_with_secrets_are_for_their_owner_alone(created, tmp_path):
+def test_files_with_secrets_are_readable_by_their_owner_only(created, tmp_path):
     for name in ("real2sim.db", "worker.key", "worker.lock"):
         assert (tmp_path / "data" / name).stat().st_mode & 0o077 == 0
 
 
-def test_a_stored_answer_opens_with_its_key_alone():
+def test_a_stored_answer_is_decrypted_only_with_its_key():
     body = json.dumps({"token": "secret"}).encode()
     stored = sealed(body, "key")
     assert unsealed(stored, "key") == body

@@ -70,7 +70,7 @@ def test_an_entry_without_its_scenario_is_refused(url):
     run(url, write)
 
 
-def test_deleting_a_scenario_takes_its_log_along(url):
+def test_deleting_a_scenario_deletes_its_log(url):
     async def work(store):
         await store.create_scenario(SCENARIO)
         store.record_revision("sc_1", 1, entry("a"), created_us=1)
@@ -91,7 +91,7 @@ def test_the_last_snapshot_of_a_scenario_is_kept(url):
     assert run(url, write) == (SnapshotRow("sc_1", 256, "1", b"\x01"), None)
 
 
-def test_snapshots_go_with_their_scenario(url):
+def test_snapshots_are_deleted_with_their_scenario(url):
     async def work(store):
         await store.create_scenario(SCENARIO)
         await store.save_snapshot(SnapshotRow("sc_1", 128, "1", b"state"))
@@ -124,7 +124,7 @@ def test_a_reply_is_stored_with_its_effect_or_not_at_all(url):
     assert run(url, work) == (REPLY, None)
 
 
-def test_a_reply_is_forgotten_after_a_day(url, monkeypatch):
+def test_a_reply_expires_after_a_day(url, monkeypatch):
     async def work(store):
         await store.create_scenario(SCENARIO, reply=REPLY)
         day_us = 24 * 3600 * 1_000_000
@@ -153,7 +153,7 @@ def test_a_session_log_is_appended_all_or_nothing(url):
     assert run(url, work) == ([first], [second])
 
 
-def test_open_sessions_are_those_of_the_worker_that_were_not_closed(url):
+def test_open_sessions_are_the_unclosed_ones_of_a_worker(url):
     async def work(store):
         for session_id, worker_id in (("w0.1", "w0"), ("w0.2", "w0"), ("w1.1", "w1")):
             row = replace(SESSION, session_id=session_id, worker_id=worker_id)
@@ -168,7 +168,7 @@ def test_open_sessions_are_those_of_the_worker_that_were_not_closed(url):
     assert closed.closed_us is not None
 
 
-def test_a_write_ahead_log_is_used(sqlite_url, tmp_path):
+def test_sqlite_uses_a_write_ahead_log(sqlite_url, tmp_path):
     async def work(store):
         await store.create_scenario(SCENARIO)
         return (tmp_path / "deep" / "store.db-wal").exists()
@@ -176,7 +176,7 @@ def test_a_write_ahead_log_is_used(sqlite_url, tmp_path):
     assert run(sqlite_url, work)
 
 
-def test_entries_of_several_sessions_are_stored_together_or_not_at_all(url):
+def test_entries_of_several_sessions_are_stored_all_or_nothing(url):
     sessions = [replace(SESSION, session_id=name) for name in ("w0.1", "w0.2")]
 
     def logs(*seqs: int) -> list[ClaimedEntries]:
@@ -195,7 +195,7 @@ def test_entries_of_several_sessions_are_stored_together_or_not_at_all(url):
     assert run(url, work) == [[0, 1], [0, 1]]
 
 
-def test_steps_are_appended_without_a_file_for_each_transaction(sqlite_url):
+def test_sqlite_keeps_temporary_data_in_memory(sqlite_url):
     async def work(store):
         await store.create_session(SESSION)
         writer = store.database._writer.connection.dbapi_connection
@@ -206,14 +206,14 @@ def test_steps_are_appended_without_a_file_for_each_transaction(sqlite_url):
 
 
 NORMAL, FULL = 1, 2
-"""How SQLite names what it waits for: nothing at a commit, or the disk."""
+"""Values of SQLite's ``synchronous``: do not sync at a commit, or sync to disk."""
 
 
 @pytest.mark.parametrize(
     ("durability", "edit", "step", "answered_step"),
     [("all", FULL, FULL, FULL), ("edits", FULL, NORMAL, FULL), ("process", NORMAL, NORMAL, NORMAL)],
 )
-def test_what_is_promised_is_on_the_disk_before_it_is_acknowledged(
+def test_the_durability_setting_determines_which_writes_are_synced(
     sqlite_url, durability, edit, step, answered_step
 ):
     async def work(store):
@@ -237,7 +237,7 @@ def test_what_is_promised_is_on_the_disk_before_it_is_acknowledged(
     assert run(sqlite_url, work, durability=durability) == [edit, edit, step, answered_step]
 
 
-def test_a_newer_store_is_refused_with_both_versions(sqlite_url, tmp_path):
+def test_a_store_with_a_newer_schema_is_refused_with_both_versions(sqlite_url, tmp_path):
     async def nothing(store):
         pass
 
@@ -250,7 +250,7 @@ def test_a_newer_store_is_refused_with_both_versions(sqlite_url, tmp_path):
         run(sqlite_url, nothing)
 
 
-def test_a_file_that_is_no_database_is_refused(sqlite_url, tmp_path):
+def test_a_file_that_is_not_a_database_is_refused(sqlite_url, tmp_path):
     (tmp_path / "deep").mkdir()
     (tmp_path / "deep" / "store.db").write_bytes(b"not a database at all" * 100)
 
@@ -261,7 +261,7 @@ def test_a_file_that_is_no_database_is_refused(sqlite_url, tmp_path):
         run(sqlite_url, nothing)
 
 
-def test_a_password_in_the_url_is_not_shown():
+def test_a_password_in_the_url_is_not_revealed():
     async def nothing(store):
         pass
 
@@ -270,7 +270,7 @@ def test_a_password_in_the_url_is_not_shown():
     assert "hunter2" not in str(caught.value)
 
 
-def test_what_was_handed_over_is_written_although_the_caller_was_cancelled(url):
+def test_a_started_write_completes_when_its_caller_is_cancelled(url):
     async def work(store):
         await store.create_scenario(SCENARIO)
         row = {"scenario_id": "sc_1", "revision": 1, "kind": "edit", "created_us": 1}
@@ -285,7 +285,7 @@ def test_what_was_handed_over_is_written_although_the_caller_was_cancelled(url):
     assert run(url, work) == [entry("a")]
 
 
-def test_a_store_in_memory_works_too():
+def test_an_in_memory_store_works():
     async def work(store):
         await store.create_scenario(SCENARIO)
         return await store.scenario("sc_1")
@@ -293,7 +293,7 @@ def test_a_store_in_memory_works_too():
     assert run("sqlite://", work) == SCENARIO
 
 
-def test_appending_nothing_is_allowed(url):
+def test_an_empty_append_is_allowed(url):
     async def work(store):
         await store.create_session(SESSION)
         await store.append_session_entries(SESSION.claim, [])
@@ -335,7 +335,7 @@ def test_a_scenario_is_created_with_its_log_or_not_at_all(url):
     assert run(url, work) == (log, None)
 
 
-def test_a_write_without_space_leaves_the_connection_for_readers_and_later_writes(sqlite_url):
+def test_after_a_full_disk_the_connection_still_reads_and_writes(sqlite_url):
     async def fill(store):
         await store.create_scenario(SCENARIO)
         writer = store.database._writer.connection.dbapi_connection
@@ -354,7 +354,7 @@ def test_a_write_without_space_leaves_the_connection_for_readers_and_later_write
     assert (len(before), len(after)) == (0, 1)
 
 
-def test_a_store_in_trouble_refuses_without_asking_its_database(sqlite_url, monkeypatch):
+def test_a_failed_store_refuses_without_querying_its_database(sqlite_url, monkeypatch):
     def ask(*_arguments, **_options):
         raise AssertionError
 
@@ -377,7 +377,7 @@ def action(seq: int) -> SessionEntry:
     return SessionEntry(seq, "action", seq, b"\x80", 1)
 
 
-def test_an_append_on_a_server_is_prepared_and_fenced(postgres):
+def test_an_append_on_postgresql_is_prepared_and_fenced(postgres):
     url = postgres.new_database()
 
     async def work(store):
@@ -396,7 +396,7 @@ def test_an_append_on_a_server_is_prepared_and_fenced(postgres):
     assert run(url, work) == [0, 1, 2]
 
 
-def test_a_prepared_append_goes_on_when_the_server_was_restarted(postgres):
+def test_prepared_appends_continue_after_a_server_restart(postgres):
     url = postgres.new_database()
 
     async def work(store):

@@ -1,4 +1,4 @@
-"""A browser in front of a worker; needs Playwright and a Chromium of the system."""
+"""A browser with a worker. Needs Playwright and a system Chromium."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from real2sim_server.service.serve import RunningWorker, running_worker
 from .hands import STEP_MS, kept
 
 BROWSERS = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome")
-"""The lightest first."""
+"""Lightest first."""
 BROWSER = next(filter(None, map(shutil.which, BROWSERS)), "")
 
 
 @pytest.fixture(scope="module")
 def browser_args() -> list[str]:
-    """Of the browser's command line."""
+    """Command-line arguments of the browser."""
     return ["--no-sandbox"]
 
 
 @pytest.fixture(scope="module")
 def chromium(browser_args: list[str]) -> Iterator[Any]:
-    """A headless browser; skips where there is none."""
+    """A headless browser. Skips if there is none."""
     sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
     if not BROWSER:
         pytest.skip("no chromium on the PATH")
@@ -45,7 +45,7 @@ def running(make_settings) -> Iterator[RunningWorker]:
 
 @pytest.fixture
 def visit(chromium) -> Iterator[Callable[[str], Any]]:
-    """Opens pages; at the end of the test none of them may have thrown."""
+    """Open pages. At the end of the test, no page may have raised an error."""
     errors: list[str] = []
     with ExitStack() as stack:
 
@@ -67,13 +67,13 @@ def visit(chromium) -> Iterator[Callable[[str], Any]]:
 
 @pytest.fixture
 def page(visit, running) -> Any:
-    """The first page of the studio."""
+    """The start page of the studio."""
     return visit(f"{running.url}/ui")
 
 
 @pytest.fixture
 def looking(page) -> Any:
-    """The studio with the tiny scene as it was recorded."""
+    """The studio with the recorded tiny scene."""
     page.click("[data-scene=tiny]")
     page.wait_for_selector("body[data-ready]")
     return page

@@ -1,4 +1,4 @@
-"""What a person does in the studio, and reads there."""
+"""User actions in the studio, and values read from it."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ STEP_MS = LIMIT_S * 1e3
 
 
 def place(page: Any, canvas: str, module: str, call: str) -> tuple[float, float]:
-    """Where something is on the page, as a module of the studio tells [px]."""
+    """Page position of something, computed by a module of the studio [px]."""
     inside = page.evaluate(f"async () => (await import('/ui/{module}')).{call}")
     box = page.locator(canvas).bounding_box()
     return box["x"] + inside[0], box["y"] + inside[1]
 
 
 def drag(page: Any, start: tuple[float, float], by: tuple[float, float]) -> None:
-    """Take, move, let go."""
+    """Press, move and release the mouse."""
     page.mouse.move(*start)
     page.mouse.down()
     page.mouse.move(start[0] + by[0], start[1] + by[1], steps=5)
@@ -31,7 +31,7 @@ def kept(page: Any, revision: int) -> None:
 
 
 def field(page: Any, name: str) -> float:
-    """A number in a field."""
+    """Value of a number field."""
     return float(page.input_value(f"#{name}"))
 
 
@@ -42,17 +42,17 @@ def enter(page: Any, name: str, value: float) -> None:
 
 
 def shown(page: Any, expression: str) -> Any:
-    """A value of what the studio shows, as JavaScript on its ``model``."""
+    """A value of the studio's state, as a JavaScript expression on its ``model``."""
     return page.evaluate(
         f"async () => {{ const {{ model }} = await import('/ui/model.js'); return {expression}; }}"
     )
 
 
 def address(page: Any) -> dict[str, str]:
-    """What the address of the page says is open; it follows within a quarter of a second."""
+    """State in the page's URL, which updates within a quarter of a second."""
     return {k: v[0] for k, v in parse_qs(urlsplit(page.evaluate("location.href")).query).items()}
 
 
 def wait_address(page: Any, **values: str) -> None:
-    """Return once the address says so."""
+    """Wait until the URL has this state."""
     wait_until(lambda: values.items() <= address(page).items(), lambda: f"{values} in {page.url}")

@@ -1,4 +1,4 @@
-"""What is renamed in the studio, deleted, and taken back."""
+"""Renaming, deleting and undeleting in the studio."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def answer(page: Any, text: str) -> None:
     page.once("dialog", lambda dialog: dialog.accept(text))
 
 
-def test_scenarios_are_renamed_deleted_and_taken_back(page, client):
+def test_scenarios_are_renamed_deleted_and_restored(page, client):
     kept = client.scenarios.create(scene="tiny", name="rain")
     client.scenarios.create(scene="tiny", name="snow")
     page.reload()
@@ -54,7 +54,7 @@ def test_scenarios_are_renamed_deleted_and_taken_back(page, client):
     assert names(client) == ["sun"]
 
 
-def test_an_asset_in_use_says_by_what_and_another_is_taken_back(studio, client):
+def test_an_asset_in_use_names_its_scenario_and_an_unused_one_is_restored(studio, client):
     for asset_id in ("used", "spare"):
         client.assets.cut(scene="tiny", object_id="post", asset_id=asset_id)
     (info,) = client.scenarios.list()

@@ -1,4 +1,4 @@
-"""Driving in the studio, and the work that it lists."""
+"""Driving in the studio, and its list of jobs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def driven(page: Any, text: str) -> None:
     page.wait_for_selector(f"#drive-now:has-text('{text}')")
 
 
-def test_a_planner_is_watched_held_and_relieved_and_the_drive_is_read_afterwards(studio):
+def test_a_planner_is_watched_held_and_replaced_by_hand_driving(studio):
     studio.click("[data-tab=drive]")
     studio.select_option("#drive-who", "follow_route")
     studio.select_option("#drive-pace", "0.25")
@@ -34,7 +34,7 @@ def test_a_planner_is_watched_held_and_relieved_and_the_drive_is_read_afterwards
     studio.click("#drive-step")
     driven(studio, f"step {held + 1} ")
 
-    # A reload goes on watching.
+    # Watching continues after a reload.
     studio.reload()
     studio.wait_for_selector("body[data-ready]")
     driven(studio, f"held · step {held + 1} ")
@@ -63,7 +63,7 @@ def test_a_planner_is_watched_held_and_relieved_and_the_drive_is_read_afterwards
     studio.wait_for_selector("#drive-start")
 
 
-def test_work_shows_what_is_left_and_is_found_again_after_a_reload(studio):
+def test_jobs_are_listed_with_their_files_after_a_reload(studio):
     studio.click("[data-tab=work]")
     studio.wait_for_selector("#work:has-text('No jobs yet')")
     studio.click("#make-video")
@@ -85,7 +85,7 @@ def test_work_shows_what_is_left_and_is_found_again_after_a_reload(studio):
     assert studio.locator(".work").count() == 1
 
 
-def test_a_corner_case_is_chosen_by_its_picture_taken_over_undone_and_dropped(studio):
+def test_a_corner_case_is_applied_removed_and_restored(studio):
     studio.click("[data-tab=drive]")
     studio.select_option("#corner-case", "cut_in")
     studio.wait_for_selector("#drive:has-text('a car moves in from the left')")
@@ -111,7 +111,7 @@ def test_a_corner_case_is_chosen_by_its_picture_taken_over_undone_and_dropped(st
 
 
 def held_drive(studio: Any) -> None:
-    """Start a planner, and hold it."""
+    """Start a planner and hold it."""
     studio.click("[data-tab=drive]")
     studio.select_option("#drive-who", "follow_route")
     studio.select_option("#drive-pace", "0.25")
@@ -121,7 +121,7 @@ def held_drive(studio: Any) -> None:
     driven(studio, "held")
 
 
-def test_all_cameras_show_the_drive_that_is_watched(studio):
+def test_the_mosaic_shows_all_cameras_of_the_live_drive(studio):
     held_drive(studio)
     asked: list[str] = []
     studio.on("request", lambda request: asked.append(request.url))
@@ -129,14 +129,14 @@ def test_all_cameras_show_the_drive_that_is_watched(studio):
     studio.wait_for_selector("#mosaic figure[data-camera=left] img[src]")
     assert sum("/render" in url for url in asked) >= 2
     assert not any("/preview" in url for url in asked)
-    # Another step, other pictures.
+    # After another step, the images differ.
     source = "document.querySelector('#mosaic figure[data-camera=left] img').src"
     before = studio.evaluate(source)
     studio.click("#drive-step")
     studio.wait_for_function(f"before => {source} !== before", arg=before)
 
 
-def test_edits_while_driving_change_the_drive_and_not_the_scenario(studio):
+def test_edits_while_driving_change_the_drive_but_not_the_scenario(studio):
     held_drive(studio)
     studio.click("[data-tab=properties]")
     studio.click("#properties button:has-text('post')")
@@ -158,7 +158,7 @@ def test_edits_while_driving_change_the_drive_and_not_the_scenario(studio):
     assert shown(studio, "model.scenario.objects.map((o) => o.object_id)") == RECORDED
 
 
-def test_what_a_storyboard_brings_is_in_the_list_and_on_the_map(studio):
+def test_storyboard_entities_are_in_the_list_and_on_the_map(studio):
     studio.click("[data-tab=drive]")
     studio.select_option("#corner-case", "cut_in")
     studio.click("#take-case")

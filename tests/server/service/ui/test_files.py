@@ -9,7 +9,7 @@ import pytest
 from real2sim_server.service.routes.server import FOLDER, STUDIO
 
 OWN = sorted(name for name in STUDIO if not name.startswith("vendor/"))
-"""What is vendored is as its authors have published it."""
+"""Own files. Vendored files are unmodified."""
 MODULES = [name for name in OWN if name.endswith(".js")]
 IMPORT = re.compile(r'^import (?:\{([^}]*)\} )?from "\./([\w.]+)";', re.MULTILINE)
 EXPORT = re.compile(r"^export (?:async )?(?:function\*?|const|let|class) (\w+)", re.MULTILINE)
@@ -19,19 +19,19 @@ def text(name: str) -> str:
     return (FOLDER / name).read_text()
 
 
-def test_the_page_is_served_with_a_policy_that_allows_nothing_from_elsewhere(client):
+def test_the_page_has_a_restrictive_content_security_policy(client):
     answer = client.get("/ui")
     assert answer.headers["content-type"].startswith("text/html")
     assert "default-src 'none'; script-src 'self'" in answer.headers["content-security-policy"]
 
 
-def test_the_root_leads_to_the_page(client):
+def test_the_root_redirects_to_the_page(client):
     for path in ("/", "/ui"):
         answer = client.get(path, follow_redirects=False)
         assert (answer.status_code, answer.headers["location"]) == (307, "/ui/")
 
 
-def test_the_page_needs_no_token_and_its_data_does(start_worker):
+def test_the_page_needs_no_token_but_its_data_does(start_worker):
     client = start_worker(token="correct horse")
     assert client.get("/ui/").status_code == 200
     assert client.get("/v1/scenes").status_code == 401
@@ -44,20 +44,20 @@ def test_other_files_are_not_served(client):
 
 
 @pytest.mark.parametrize("name", MODULES)
-def test_a_module_imports_only_what_another_exports(name):
+def test_modules_import_only_exported_names(name):
     for names, module in IMPORT.findall(text(name)):
         exported = set(EXPORT.findall(text(module)))
         assert {n.strip() for n in names.split(",") if n.strip()} <= exported
 
 
-def test_modules_are_served_as_javascript_and_short(client):
+def test_modules_are_served_as_javascript_and_under_600_lines(client):
     for name in MODULES:
         answer = client.get(f"/ui/{name}")
         assert answer.headers["content-type"].startswith("text/javascript"), name
         assert len(answer.text.splitlines()) < 600, name
 
 
-def test_what_is_vendored_is_what_the_notices_say():
+def test_vendored_files_match_the_notices():
     notices = Path(__file__).parents[4].joinpath("THIRD_PARTY.md").read_text()
     stated = dict(re.findall(r"(?m)^\| (\S+) \| `([0-9a-f]{64})` \|$", notices))
     there = {
@@ -77,16 +77,16 @@ def test_no_file_names_another_host(name):
     assert [a for a in addresses if a != "http://www.w3.org"] == []
 
 
-def test_every_element_that_a_module_asks_for_exists():
+def test_every_element_used_by_a_module_exists():
     made = re.findall(r'\bid: "([\w-]+)"', "".join(map(text, MODULES)))
     pages = text("index.html") + text("fleet.html")
     there = set(re.findall(r'\bid="([\w-]+)"', pages)) | set(made)
     asked = re.findall(r'(?:\$|getElementById)\("([\w-]+)"\)', "".join(map(text, MODULES)))
-    # Fields of the pose are made one for each axis.
+    # The pose fields are created for each axis.
     assert {a for a in asked if not a.startswith("pose-")} <= there
 
 
-def test_the_page_of_the_fleet_shows_what_workers_tell(client):
+def test_the_fleet_page_shows_fields_that_workers_report(client):
     page = client.get("/ui/fleet.html")
     assert page.status_code == 200
     assert 'src="fleet.js"' in page.text

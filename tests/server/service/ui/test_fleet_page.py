@@ -1,4 +1,4 @@
-"""The page of the fleet."""
+"""The fleet page."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def fleet(visit, running):
     return page
 
 
-def test_each_worker_has_a_line_that_follows_what_it_does(fleet, running):
+def test_each_worker_has_a_row_that_updates(fleet, running):
     line = fleet.locator("[data-worker]")
     assert line.count() == 1
     assert "ready" in line.inner_text()
@@ -33,7 +33,7 @@ def test_each_worker_has_a_line_that_follows_what_it_does(fleet, running):
     assert fleet.inner_text("#summary") == "Workers there: 1 of 1. Sessions: 1."
 
 
-def test_a_narrow_page_lets_one_scroll_to_every_column(fleet):
+def test_a_narrow_page_scrolls_to_every_column(fleet):
     fleet.set_viewport_size({"width": 390, "height": 800})
     table = fleet.locator("#fleet")
     assert table.evaluate("e => e.scrollWidth > e.clientWidth")
@@ -44,7 +44,7 @@ def test_a_narrow_page_lets_one_scroll_to_every_column(fleet):
     assert table.evaluate("e => e.scrollWidth <= e.clientWidth")
 
 
-def test_a_worker_with_a_token_is_asked_with_it(visit, make_settings):
+def test_the_page_sends_a_token_to_a_worker_that_requires_one(visit, make_settings):
     with running_worker(make_settings(token="correct horse")) as worker:
         page = visit(f"{worker.url}/ui/fleet.html")
         page.wait_for_selector("#token[open]")
@@ -53,7 +53,7 @@ def test_a_worker_with_a_token_is_asked_with_it(visit, make_settings):
         page.wait_for_selector("[data-worker]:has-text('ready')")
 
 
-def test_axe_finds_nothing_serious(fleet):
+def test_axe_finds_no_serious_issue(fleet):
     if not AXE.is_file():
         pytest.skip("axe-core is not installed: npm ci")
     fleet.evaluate(AXE.read_text())

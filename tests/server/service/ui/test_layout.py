@@ -1,4 +1,4 @@
-"""The page itself: its places, sizes, keys and fingers, on large and small screens."""
+"""Layout, sizes, keyboard and touch on large and small screens."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def size(page: Any, selector: str) -> tuple[float, float]:
     return box["width"], box["height"]
 
 
-def test_the_picture_has_most_of_the_page_and_panels_keep_the_size_they_are_given(studio):
+def test_the_picture_fills_most_of_the_page_and_panel_sizes_persist(studio):
     studio.set_viewport_size({"width": 1920, "height": 1080})
     width, height = size(studio, "#stage")
     assert width * height > 0.6 * 1920 * 1080
@@ -48,7 +48,7 @@ def test_the_picture_has_most_of_the_page_and_panels_keep_the_size_they_are_give
     assert size(studio, "#stage")[0] < 600
 
 
-def test_panels_are_tabs_walked_by_arrow_keys_and_cameras_stand_in_the_order_they_look(studio):
+def test_tabs_follow_arrow_keys_and_cameras_are_sorted_by_direction(studio):
     studio.focus("[role=tab][aria-selected=true]")
     for _ in range(2):
         studio.keyboard.press("ArrowDown")
@@ -70,7 +70,7 @@ def test_panels_are_tabs_walked_by_arrow_keys_and_cameras_stand_in_the_order_the
     assert ahead == sorted(ahead, reverse=True)
 
 
-def test_axe_finds_nothing_serious_in_any_panel(studio):
+def test_axe_finds_no_serious_issue_in_any_panel(studio):
     if not AXE.is_file():
         pytest.skip("axe-core is not installed: npm ci")
     studio.evaluate(AXE.read_text())
@@ -85,7 +85,7 @@ def test_axe_finds_nothing_serious_in_any_panel(studio):
     assert found == []
 
 
-def test_everything_is_reached_on_a_phone(studio):
+def test_every_panel_fits_a_phone(studio):
     studio.set_viewport_size(PHONE)
     wide = "document.documentElement.scrollWidth"
     assert studio.evaluate(wide) == PHONE["width"]
@@ -114,7 +114,7 @@ PINCH = """() => {
 }"""
 
 
-def test_two_fingers_zoom_the_map_and_a_cancelled_drag_changes_nothing(studio):
+def test_pinching_zooms_the_map_and_a_cancelled_drag_changes_nothing(studio):
     scale = "async () => (await import('/ui/map_view.js')).view.scale"
     before = studio.evaluate(scale)
     studio.evaluate(PINCH)
@@ -140,7 +140,7 @@ def test_two_fingers_zoom_the_map_and_a_cancelled_drag_changes_nothing(studio):
     kept(studio, 0)
 
 
-def test_a_wrong_link_leads_to_a_page_that_says_what_to_do(visit, running):
+def test_a_broken_link_shows_a_page_that_leads_back(visit, running):
     page = visit(f"{running.url}/ui/?scenario=sc_nothing")
     page.wait_for_selector("#lost a")
     assert "sc_nothing" in page.inner_text("#lost")
@@ -148,7 +148,7 @@ def test_a_wrong_link_leads_to_a_page_that_says_what_to_do(visit, running):
     page.wait_for_selector("[data-scene=tiny]")
 
 
-def test_a_worker_that_is_gone_is_told(visit, make_settings):
+def test_an_unreachable_worker_is_reported(visit, make_settings):
     with running_worker(make_settings()) as running:
         page = visit(f"{running.url}/ui")
         page.click("[data-scene=tiny]")

@@ -1,4 +1,4 @@
-"""Looking at a scene makes nothing; the first edit makes a scenario."""
+"""Viewing a scene creates nothing. The first edit creates a scenario."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def scenarios(running: Any) -> list[dict[str, Any]]:
     return listed
 
 
-def test_whoever_looks_leaves_nothing_and_can_share_what_is_seen(looking, visit, running):
+def test_viewing_creates_no_scenario_and_the_view_is_shareable(looking, visit, running):
     looking.wait_for_selector("#picture[data-seq]")
     assert looking.inner_text("#name") == "tiny"
     assert looking.inner_text("#saved") == "Nothing changed yet"
@@ -45,7 +45,7 @@ def test_a_worker_without_scenes_offers_the_demo_street(visit, make_settings, tm
         assert not page.is_visible("text=Add the demo street")
 
 
-def test_the_first_edit_makes_the_scenario_and_the_picture_follows(looking, running):
+def test_the_first_edit_creates_the_scenario_and_updates_the_picture(looking, running):
     looking.wait_for_selector("#picture[data-seq]")
     looking.evaluate("async () => (await import('/ui/model.js')).select('car_red')")
     before = field(looking, "pose-x")
@@ -64,7 +64,7 @@ def test_the_first_edit_makes_the_scenario_and_the_picture_follows(looking, runn
     assert not looking.is_visible("#gone")
 
 
-def test_an_edit_that_is_refused_makes_nothing(looking, running):
+def test_a_refused_edit_creates_no_scenario(looking, running):
     looking.evaluate(
         "async () => (await import('/ui/model.js')).edit([{ op: 'delete', object_id: 'nobody' }])"
     )

@@ -1,4 +1,4 @@
-"""What the panels of the studio do to a scenario."""
+"""Effects of the studio's panels on a scenario."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def at(page: Any, share: float) -> None:
     )
 
 
-def test_a_move_from_now_on_leaves_what_was_before(studio):
+def test_a_move_from_now_on_does_not_change_earlier_poses(studio):
     first(studio)
     at(studio, 0)
     before = field(studio, "pose-y")
@@ -51,7 +51,7 @@ def test_a_move_from_now_on_leaves_what_was_before(studio):
     assert not studio.is_visible("#when-mode")
 
 
-def test_the_speed_shown_is_the_one_that_holds_and_an_object_may_do_the_same_later(studio):
+def test_the_shown_speed_is_the_current_one_and_an_object_can_start_later(studio):
     first(studio)
     enter(studio, "retime-speed", 2)
     kept(studio, 1)
@@ -68,7 +68,7 @@ def test_the_speed_shown_is_the_one_that_holds_and_an_object_may_do_the_same_lat
     assert shown(studio, "model.scenario.objects[0].start_us") == start + 500_000
 
 
-def test_the_heading_of_what_moves_turns_its_path(studio):
+def test_the_heading_of_a_moving_object_turns_its_path(studio):
     studio.click(".object-list button:has-text('car_blue')")
     at(studio, 0.4)
     place_then = field(studio, "pose-x"), field(studio, "pose-y")
@@ -84,7 +84,7 @@ def test_the_heading_of_what_moves_turns_its_path(studio):
     assert math.degrees(math.atan2(y1 - y0, x1 - x0)) == pytest.approx(42, abs=0.5)
 
 
-def test_keys_are_for_the_control_that_has_the_focus(studio):
+def test_keys_act_on_the_focused_control(studio):
     target = first(studio)
     studio.focus("[data-tab='properties'], [role=tab] >> nth=0")
     studio.keyboard.press("Delete")
@@ -99,7 +99,7 @@ def test_keys_are_for_the_control_that_has_the_focus(studio):
     studio.keyboard.press("Space")
     assert studio.is_checked("#work-of-all") != ticked
     assert studio.inner_text("#play") == "Play"
-    # Nothing was deleted, and letters go on as shortcuts.
+    # Nothing was deleted, and letter shortcuts still work.
     assert shown(studio, "model.scenario.revision") == 0
     assert shown(studio, f"model.scenario.objects.some((o) => o.object_id === '{target}')")
     studio.focus("#next")
@@ -110,7 +110,7 @@ def test_keys_are_for_the_control_that_has_the_focus(studio):
     )
 
 
-def test_fields_are_tabbed_through_and_keys_typed_there_are_no_shortcuts(studio):
+def test_fields_are_tabbed_through_and_typing_triggers_no_shortcuts(studio):
     target = first(studio)
     studio.click("#pose-x")
     studio.keyboard.type("5")
@@ -120,13 +120,13 @@ def test_fields_are_tabbed_through_and_keys_typed_there_are_no_shortcuts(studio)
     assert studio.evaluate("document.activeElement.id") == "heading"
     studio.keyboard.press("Delete")
     studio.keyboard.press("Tab")
-    # What comes later is stored behind what these keys might have done.
+    # This edit is stored after anything those keys might have done.
     enter(studio, "pose-x", 6)
     kept(studio, 2)
     assert field(studio, "pose-x") == 6
     assert shown(studio, f"model.scenario.objects.some((o) => o.object_id === '{target}')")
     assert shown(studio, "model.scenario.revision") == 2
-    # Two fields edited at once both hold.
+    # Two fields edited at once are both applied.
     studio.evaluate(
         """() => ['x', 'y'].forEach((axis, k) => {
           const input = document.getElementById(`pose-${axis}`);
@@ -138,7 +138,7 @@ def test_fields_are_tabbed_through_and_keys_typed_there_are_no_shortcuts(studio)
     assert [field(studio, f"pose-{axis}") for axis in "xy"] == [3, 4]
 
 
-def test_a_pose_typed_while_a_run_is_shown_is_where_the_object_is_put(studio):
+def test_a_pose_typed_while_a_run_is_shown_is_applied(studio):
     first(studio)
     enter(studio, "velocity-x", 4)
     kept(studio, 1)
@@ -151,7 +151,7 @@ def test_a_pose_typed_while_a_run_is_shown_is_where_the_object_is_put(studio):
         " setTime(span().end_us); }"
     )
     studio.click("[data-tab=properties]")
-    studio.wait_for_url("**run=**")  # the address follows within a quarter of a second
+    studio.wait_for_url("**run=**")  # the URL updates within a quarter of a second
     link = studio.url
     enter(studio, "pose-x", 30)
     kept(studio, 2)
@@ -162,7 +162,7 @@ def test_a_pose_typed_while_a_run_is_shown_is_where_the_object_is_put(studio):
 
 
 def plotted(page: Any, canvas: str) -> bool:
-    """Whether anything is drawn on it."""
+    """Whether the plot is not empty."""
     return page.evaluate(
         """id => { const c = document.getElementById(id);
           const { data } = c.getContext('2d').getImageData(0, 0, c.width, c.height);
@@ -171,7 +171,7 @@ def plotted(page: Any, canvas: str) -> bool:
     )
 
 
-def test_a_box_erases_stops_and_is_taken_back(studio):
+def test_a_box_erases_and_collides_and_is_removed(studio):
     enter(studio, "box-x", 21)
     studio.click("#erase")
     kept(studio, 1)
@@ -187,7 +187,7 @@ def test_a_box_erases_stops_and_is_taken_back(studio):
     assert shown(studio, "model.scenario.erased.length") == 0
 
 
-def test_the_box_is_dragged_on_the_map_and_a_scenario_plays_in_the_span_given(studio):
+def test_the_box_is_dragged_on_the_map_and_the_end_time_is_set(studio):
     x = field(studio, "box-x")
     drag(studio, place(studio, "#map", "map.js", "screenOfBox()"), (45, 0))
     assert field(studio, "box-x") > x + 1
@@ -201,7 +201,7 @@ def test_the_box_is_dragged_on_the_map_and_a_scenario_plays_in_the_span_given(st
     assert shown(studio, "model.scenario.end_us") == end / 2
 
 
-def test_a_kept_object_is_inserted_and_takes_the_place_of_another(studio):
+def test_an_object_saved_as_an_asset_is_inserted_and_replaces_another(studio):
     target = first(studio)
     studio.click("[data-tab=assets]")
     studio.click("button:has-text('as asset')")
@@ -228,7 +228,7 @@ def test_a_worker_with_a_token_asks_for_it(visit, make_settings):
         page.wait_for_selector("#picture[data-seq]")
 
 
-def test_what_is_copied_as_python_or_curl_makes_the_same_scenario(studio, running):
+def test_copied_python_and_curl_scripts_recreate_the_scenario(studio, running):
     edited(studio)
     studio.click("[data-tab=log]")
     studio.click("#copy-python")
@@ -243,9 +243,7 @@ def test_what_is_copied_as_python_or_curl_makes_the_same_scenario(studio, runnin
     assert new[-1].revision == old.revision
 
 
-def test_a_picture_that_shows_an_edit_of_somebody_else_brings_the_panels_up_to_date(
-    studio, running
-):
+def test_an_edit_by_another_client_updates_the_panels(studio, running):
     target = first(studio)
     x = field(studio, "pose-x")
     scenario = shown(studio, "model.scenario.scenario_id")
@@ -265,7 +263,7 @@ def edited(page: Any) -> None:
     kept(page, 2)
 
 
-def test_a_fork_goes_its_own_way(studio):
+def test_a_fork_evolves_independently(studio):
     edited(studio)
     address = studio.url
     studio.click("#fork")
@@ -280,7 +278,7 @@ def test_a_fork_goes_its_own_way(studio):
 
 
 @pytest.mark.slow
-def test_a_data_set_is_made_and_looked_at(studio):
+def test_a_data_set_is_estimated_created_and_previewed(studio):
     studio.click('[data-tab="datasets"]')
     enter(studio, "dataset-period", 1.0)
     enter(studio, "dataset-width", 96)

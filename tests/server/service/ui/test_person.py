@@ -1,4 +1,4 @@
-"""A person edits a scene with the mouse."""
+"""A user edits a scene with the mouse."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from .hands import drag, field, kept, place, shown, wait_address
 pytestmark = [pytest.mark.browser, pytest.mark.network]
 
 
-def test_a_person_edits_runs_and_finds_everything_again(page):
+def test_a_user_edits_simulates_and_reloads(page):
     page.click("[data-scene=tiny]")
     page.wait_for_selector("body[data-ready]")
     page.wait_for_selector("#picture[data-seq]")

@@ -1,4 +1,4 @@
-"""The three-dimensional view, drawn by the page itself (software WebGL)."""
+"""The 3D view, rendered by the page (software WebGL)."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from .hands import drag, kept, shown
 
 pytestmark = [pytest.mark.browser, pytest.mark.network]
 MIN_PSNR = 38.0
-"""[dB]; 45 were seen."""
+"""[dB]. Measured: 45."""
 
 
 @pytest.fixture(scope="module")
 def browser_args() -> list[str]:
-    """WebGL is drawn by software."""
+    """WebGL in software."""
     return ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 
 
 def opened(studio: Any, width: int = 700) -> Any:
-    """The view with the whole scene in it, small: software draws it."""
+    """The 3D view with the whole scene, small because it is rendered in software."""
     studio.set_viewport_size({"width": width, "height": 560})
     studio.click("#space-mode")
     studio.wait_for_selector("#space[data-whole][data-detail=whole]")
@@ -38,7 +38,7 @@ def opened(studio: Any, width: int = 700) -> Any:
 
 
 def wait_drawn(page: Any) -> None:
-    """Return once the canvas stays as it is: some pictures are drawn after the last change."""
+    """Wait until the canvas is stable. Some images are drawn after the last change."""
     seen: list[np.ndarray] = []
 
     def stays() -> bool:
@@ -50,18 +50,18 @@ def wait_drawn(page: Any) -> None:
 
 
 def image_of(encoded: str) -> np.ndarray:
-    """[H, W, 3] of a picture in base64."""
+    """[H, W, 3] of a base64 image."""
     return np.asarray(Image.open(io.BytesIO(base64.b64decode(encoded))).convert("RGB"))
 
 
 def drawn(page: Any) -> np.ndarray:
-    """The canvas as it is now, without what is drawn over it [H, W, 3]."""
+    """The current canvas without overlays [H, W, 3]."""
     url = page.evaluate("() => document.getElementById('space').toDataURL()")
     return image_of(url.partition(",")[2])
 
 
 def of_worker(page: Any, running: Any) -> np.ndarray:
-    """The worker's exact picture from the same camera, as large as the canvas."""
+    """The worker's render from the same camera, at the size of the canvas."""
     view = page.evaluate("async () => (await import('/ui/space.js')).view()")
     T = np.reshape(view["T"], (4, 4))
     camera = {
@@ -86,7 +86,7 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
     return float(10 * np.log10(255**2 / error))
 
 
-def test_the_page_draws_what_the_worker_draws_and_goes_round_where_no_object_is(studio, running):
+def test_the_page_matches_the_worker_and_dragging_the_background_orbits(studio, running):
     page = opened(studio)
     exact = of_worker(page, running)
     assert drawn(page).shape == exact.shape
@@ -113,7 +113,7 @@ def middle_of(page: Any, name: str) -> tuple[float, float]:
     return box["x"] + inside[0], box["y"] + inside[1]
 
 
-def test_a_dragged_object_moves_at_once_and_makes_one_edit(studio):
+def test_a_dragged_object_moves_immediately_and_makes_one_edit(studio):
     page = opened(studio)
     place = "model.scenario.objects.find((o) => o.object_id === 'car_red').trajectory.positions[0]"
     before, pixels = shown(page, place), drawn(page)
@@ -133,7 +133,7 @@ def test_a_dragged_object_moves_at_once_and_makes_one_edit(studio):
     assert shown(page, "model.history.entries.length") == 1
 
 
-def test_the_ring_of_an_object_turns_it(studio):
+def test_dragging_the_ring_of_an_object_turns_it(studio):
     page = opened(studio)
     yaw = "model.scenario.objects.find((o) => o.object_id === 'car_red').trajectory.quaternions[0]"
     before = shown(page, yaw)
@@ -149,7 +149,7 @@ def test_the_ring_of_an_object_turns_it(studio):
         }"""
     )
     box = page.locator("#stage").bounding_box()
-    # The nearest point of the ring is the lowest in the picture: beside the car, on the road.
+    # The nearest point of the ring is the lowest in the image: next to the car, on the road.
     x, y = max((p for p in ring if p), key=lambda p: p[1])
     drag(page, (box["x"] + x, box["y"] + y), (40, 0))
     kept(page, 1)
@@ -159,8 +159,8 @@ def test_the_ring_of_an_object_turns_it(studio):
     assert shown(page, "model.history.entries[0].operations[0].op") in {"rotate", "set_pose"}
 
 
-def test_a_device_that_is_too_slow_shows_the_workers_picture_of_the_same_camera(studio):
-    """As it is where a processor draws: said by a part that is one of many, and slow."""
+def test_a_slow_device_shows_the_workers_picture_of_the_same_camera(studio):
+    """Simulates software rendering: a part that claims a million splats and is slow to draw."""
 
     def one_of_many(route: Any) -> None:
         answer = route.fetch()
@@ -188,8 +188,8 @@ def test_a_device_that_is_too_slow_shows_the_workers_picture_of_the_same_camera(
     )
 
 
-def test_a_picture_at_rest_tells_that_it_is_whole_also_where_it_shows_the_same(studio):
-    """Another object came while nothing moved, and is shown whole already."""
+def test_a_static_picture_is_reported_complete_after_more_data_arrives(studio):
+    """Another object arrives while nothing moves, and is already shown completely."""
     studio.evaluate(
         """async () => {
           const { Pace } = await import('/ui/pace.js');
@@ -210,7 +210,7 @@ def test_a_picture_at_rest_tells_that_it_is_whole_also_where_it_shows_the_same(s
     studio.wait_for_function("() => window.told.at(-1)")
 
 
-def test_without_webgl_the_workers_picture_stays(studio):
+def test_without_webgl_the_workers_picture_is_kept(studio):
     studio.evaluate(
         "() => { const real = HTMLCanvasElement.prototype.getContext;"
         " HTMLCanvasElement.prototype.getContext = function (kind, ...more) {"
@@ -243,7 +243,7 @@ CONVERGES = """async ([each, total]) => {
 }"""
 
 
-def test_what_moves_shows_as_much_as_comes_in_time_and_all_of_it_at_rest(page):
+def test_a_moving_view_draws_as_many_splats_as_fit_the_frame_time(page):
     total = 360_000
     for each in (4e-3, 4e-4):
         told = page.evaluate(CONVERGES, [each, total])
@@ -253,13 +253,13 @@ def test_what_moves_shows_as_much_as_comes_in_time_and_all_of_it_at_rest(page):
         assert told["steps"] == sorted(told["steps"])
         assert told["steps"][-1] == total
         assert told["after"] == pytest.approx(told["moving"]["share"])
-    # Where all of it comes in time, all of it moves.
+    # If all splats fit, all are drawn while moving.
     told = page.evaluate(CONVERGES, [1e-5, 360_000])
     assert told["moving"] == {"share": 1, "scale": 1, "shown": 360_000}
     assert told["steps"] == []
 
 
-def test_a_share_of_the_scene_is_what_covers_most_of_it(studio):
+def test_a_partial_scene_has_the_most_important_splats(studio):
     active = studio.evaluate(
         """async () => {
             const { SplatWorld } = await import('/ui/splat_world.js');
@@ -284,13 +284,13 @@ def test_a_share_of_the_scene_is_what_covers_most_of_it(studio):
     total = active["total"]
     assert total > 200
     assert active["counts"] == [total, -(-total // 2), -(-total // 10)]
-    # Who comes later comes with the same share: nothing has to be ordered anew for that.
+    # Later objects arrive with the same share, so nothing has to be reordered.
     whole, share = active["joins"]
     assert whole > 10
     assert share == -(-whole // 10)
 
 
-def test_people_assets_and_what_was_stretched_are_drawn_as_the_scenario_has_them(studio, running):
+def test_people_assets_and_scaled_objects_are_drawn_as_edited(studio, running):
     page = opened(studio)
     total = int(page.get_attribute("#space", "data-total"))
     before = drawn(page)
@@ -314,7 +314,7 @@ def test_people_assets_and_what_was_stretched_are_drawn_as_the_scenario_has_them
         lambda: np.abs(drawn(page).astype(int) - before)[around].max() > 60,
         "the visitor to be drawn",
     )
-    # Who walks is asked for at every instant, others are not.
+    # Only walking people are requested for every instant.
     asked = []
     page.on("request", lambda request: asked.append(request.url))
     page.click("#next")
@@ -322,7 +322,7 @@ def test_people_assets_and_what_was_stretched_are_drawn_as_the_scenario_has_them
     instant = f"object_id=visitor&t_us={t_us}"
     wait_until(lambda: any(instant in url for url in list_of(page, asked)), "the instant")
     assert not [url for url in asked if "splats" in url and "visitor" not in url]
-    # Their coming holds no picture up.
+    # Drawing does not wait for them.
     held = []
 
     def hold(route):
@@ -337,6 +337,6 @@ def test_people_assets_and_what_was_stretched_are_drawn_as_the_scenario_has_them
 
 
 def list_of(page: Any, asked: list[str]) -> list[str]:
-    """What was asked for, once the browser has told."""
+    """The requests so far, once the browser has reported them."""
     page.wait_for_timeout(1)
     return list(asked)

@@ -1,4 +1,4 @@
-"""The studio's picture of uncertainty."""
+"""Uncertainty images in the studio."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ pytestmark = [pytest.mark.browser, pytest.mark.network]
 
 @pytest.fixture
 def running(scenes_dir, tiny_scene, running) -> Any:
-    """A worker with a scene ``known`` as well."""
+    """A worker that also has the scene ``known``."""
     background = replace(
         tiny_scene.background, uncertainties=torch.full((len(tiny_scene.background),), 0.02)
     )
@@ -30,7 +30,7 @@ def opened(page: Any, scene: str) -> None:
     page.wait_for_selector("body[data-ready]")
 
 
-def test_the_picture_turns_to_uncertainty_stays_so_in_a_link_and_turns_back(page, visit):
+def test_uncertainty_is_toggled_and_kept_in_the_link(page, visit):
     opened(page, "known")
     page.wait_for_selector("#picture[data-seq]")
     coloured = page.get_attribute("#picture", "src")
@@ -44,7 +44,7 @@ def test_the_picture_turns_to_uncertainty_stays_so_in_a_link_and_turns_back(page
     assert shown(again, "model.shows") == "rgb"
 
 
-def test_scenes_that_know_none_have_no_button(page):
+def test_scenes_without_uncertainties_have_no_button(page):
     opened(page, "tiny")
     assert not page.is_visible("#uncertainty")
     page.keyboard.press("u")

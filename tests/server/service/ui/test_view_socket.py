@@ -33,7 +33,7 @@ def frame(socket) -> tuple[dict, bytes]:
     return json.loads(message[4 : 4 + size]), message[4 + size :]
 
 
-def test_a_look_is_answered_with_a_picture_of_the_width_asked_for(client, scenario):
+def test_a_view_request_returns_an_image_of_the_requested_width(client, scenario):
     with opened(client, scenario) as socket:
         introduce(socket)
         socket.send_json({"seq": 7, "camera": "front", "t_us": scenario["start_us"], "width": 64})
@@ -42,7 +42,7 @@ def test_a_look_is_answered_with_a_picture_of_the_width_asked_for(client, scenar
     assert data[:2] == b"\xff\xd8"
 
 
-def test_the_preview_of_an_edit_shows_it_and_changes_nothing(client, scenario):
+def test_the_preview_of_an_edit_does_not_change_the_scenario(client, scenario):
     look = {"camera": "front", "t_us": scenario["start_us"], "width": 96}
     away = [{"op": "delete", "object_id": o["object_id"]} for o in scenario["objects"]]
     with opened(client, scenario) as socket:
@@ -57,7 +57,7 @@ def test_the_preview_of_an_edit_shows_it_and_changes_nothing(client, scenario):
     assert after["revision"] == 0
 
 
-def test_a_free_camera_stands_where_it_was_put(client, scenario):
+def test_a_free_camera_uses_the_requested_pose(client, scenario):
     pose = np.array([[0, 0, 1, 3], [-1, 0, 0, 0.5], [0, -1, 0, 9], [0, 0, 0, 1.0]])
     with opened(client, scenario) as socket:
         introduce(socket)
@@ -67,7 +67,7 @@ def test_a_free_camera_stands_where_it_was_put(client, scenario):
     np.testing.assert_allclose(np.reshape(header["T_world_camera"], (4, 4)), pose, atol=1e-9)
 
 
-def test_what_cannot_be_shown_is_said_and_the_view_goes_on(client, scenario):
+def test_an_invalid_view_request_is_refused_and_the_view_continues(client, scenario):
     look = {"camera": "front", "t_us": scenario["start_us"], "width": 64}
     with opened(client, scenario) as socket:
         introduce(socket)
@@ -80,7 +80,7 @@ def test_what_cannot_be_shown_is_said_and_the_view_goes_on(client, scenario):
         assert frame(socket)[0]["width"] == 64
 
 
-def test_an_edit_of_somebody_else_is_told(client, scenario):
+def test_an_edit_by_another_client_is_announced(client, scenario):
     with opened(client, scenario) as socket:
         introduce(socket)
         socket.send_json({"camera": "front", "t_us": scenario["start_us"], "width": 64})
@@ -100,7 +100,7 @@ def test_a_wrong_token_closes_the_view(start_worker):
     assert closed.value.code == 4401
 
 
-def test_pages_of_other_sites_may_not_look(client, scenario):
+def test_cross_origin_view_sockets_are_refused(client, scenario):
     with (
         pytest.raises(WebSocketDisconnect) as refused,
         opened(client, scenario, Origin="http://elsewhere.example"),
@@ -109,7 +109,7 @@ def test_pages_of_other_sites_may_not_look(client, scenario):
     assert refused.value.code == 4403
 
 
-def test_an_object_near_the_pointer_is_picked_and_none_further_off():
+def test_only_an_object_near_the_pointer_is_picked():
     ids = np.zeros((40, 40), np.uint16)
     ids[10:20, 10:20] = 300
     assert instance_at(ids, (0.4, 0.4)) == 300
