@@ -50,7 +50,7 @@ def car(x: float, y: float = 0.0, *, speed: float = 0.0, category: str = "car") 
 
 
 def drive(speeds: list[float], *, y: float = 0.0, others=None) -> list[Instant]:
-    """Instants of a drive along x at lateral offset y; ``others(step)`` returns the other objects."""
+    """Instants of a drive along x at lateral offset y; ``others(step)`` gives the other objects."""
     x, instants = 0.0, []
     for k, speed in enumerate(speeds):
         x += speed * DT if k else 0.0

@@ -113,7 +113,7 @@ def braking(seconds: float) -> float:
 
 
 def driven(world: World, place, *, spacing_us: int, poses: int, steps: int) -> np.ndarray:
-    """Errors [m], speeds [m/s] and reverse flags when replanning ``place(seconds)`` at every step."""
+    """Errors [m], speeds [m/s] and reverse flags, replanning ``place(seconds)`` at every step."""
     found = []
     for _ in range(steps):
         times = [world.t_us + spacing_us * (k + 1) for k in range(poses)]
