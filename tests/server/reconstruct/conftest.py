@@ -19,7 +19,7 @@ FRAME_US = 100_000
 
 @dataclass(frozen=True)
 class PaintedSource:
-    """Flat colours: a road, a wall across it, and a box that moves in front of it, left to right."""
+    """Flat colours: a road, a wall across it, and a box that moves left to right before the wall."""
 
     camera: Camera
     boxes: bool

@@ -67,8 +67,8 @@ def direction_cube(resolution: int) -> torch.Tensor:
 class StreetWorld:
     """A folder of 16 frames, and a model trained on frames 10 to 13 with cameras 0 and 1.
 
-    ``rows`` holds the tracks of ``track_info.txt`` by frame, in file order. Track 5 is parked; 7, 3,
-    8 (and 1) move; 9 is a sign. In frame 12 only camera 4 sees track 3.
+    ``rows`` holds the tracks of ``track_info.txt`` by frame, in file order. Track 5 is parked;
+    7, 3, 8 (and 1) move; 9 is a sign. In frame 12 only camera 4 sees track 3.
     """
 
     rows: dict[int, list[int]] = field(
@@ -225,7 +225,7 @@ def studio_model(
 
 
 def studio_state(**models: Any) -> dict[str, Any]:
-    """A drivestudio checkpoint with 5 frames and 3 instances, the last of which is never visible."""
+    """A drivestudio checkpoint: 5 frames, 3 instances, the last of which is never visible."""
     rigid = studio_model(24, seed=3)
     quats, positions = torch.zeros(5, 3, 4), torch.zeros(5, 3, 3)
     visible = torch.zeros(5, 3, dtype=torch.bool)
