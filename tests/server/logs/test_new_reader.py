@@ -21,7 +21,7 @@ HEADER = "time_us x y z qw qx qy qz"
 
 
 def write_little(log: DrivingLog, folder: Path) -> None:
-    """Write ``ego.txt``, ``camera.txt``, a file per box, and an image and a point table per frame."""
+    """Write ``ego.txt``, ``camera.txt``, a file per box, and an image and points per frame."""
     for name in ("boxes", "images", "points"):
         (folder / name).mkdir(parents=True)
     _write_path(folder / "ego.txt", log.ego)

@@ -40,7 +40,7 @@ def folder(written_waymo_v1: Path, tmp_path: Path) -> Path:
 
 
 def test_checksum_matches_rfc_3720() -> None:
-    # RFC 3720, B.4: CRC-32C of 32 zero bytes is 0x8a9136aa. TFRecord rotates it and adds a constant.
+    # RFC 3720, B.4: CRC-32C of 32 zero bytes is 0x8a9136aa. TFRecord rotates it, adds a constant.
     crc = 0x8A9136AA
     turned = (crc >> 15 | crc << 17) & 0xFFFFFFFF
     assert masked_crc32c(bytes(32)) == (turned + 0xA282EAD8) & 0xFFFFFFFF

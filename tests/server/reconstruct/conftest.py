@@ -19,7 +19,7 @@ FRAME_US = 100_000
 
 @dataclass(frozen=True)
 class PaintedSource:
-    """Flat colours: a road, a wall across it, and a box that moves left to right before the wall."""
+    """Flat colours: a road, a wall across it, and a box that crosses in front of the wall."""
 
     camera: Camera
     boxes: bool

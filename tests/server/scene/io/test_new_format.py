@@ -1,8 +1,8 @@
 """A splat format from outside the package: the CSV of PlayCanvas' splat-transform.
 
 A header line names the columns of a trained PLY: log scales, logit opacities, rotation wxyz and
-spherical harmonics channel by channel. After one call of ``register_format`` the format can be read,
-written, imported and exported like the others.
+spherical harmonics channel by channel. After one call of ``register_format`` the format can be
+read, written, imported and exported like the others.
 """
 
 from pathlib import Path
