@@ -1,4 +1,4 @@
-"""The solver's kernels on the CPU, compiled from the same source as C++; see ``render.kernel_twin``.
+"""The solver's kernels on the CPU, compiled from their source as C++; see ``render.kernel_twin``.
 
 The source is what NVRTC gets, line for line, including the functions translated from Python.
 Needs g++, which CI machines have; tests are skipped without it.
