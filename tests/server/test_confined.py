@@ -69,7 +69,7 @@ def call(tmp_path_factory):
     starter._STARTER.close()
 
 
-def test_the_value_comes_back(call):
+def test_the_value_is_returned(call):
     assert call("double", x=21) == 42
 
 
@@ -88,13 +88,13 @@ def test_a_crash_is_an_error(call):
         call("crash")
 
 
-def test_an_end_without_a_word_is_an_error(call):
+def test_a_silent_exit_is_an_error(call):
     with pytest.raises(ConfinedError, match="exit code 3"):
         call("leave")
 
 
 @pytest.mark.parametrize("function", ["sleep", "burn"])
-def test_what_takes_too_long_is_ended(call, function):
+def test_a_call_that_takes_too_long_is_stopped(call, function):
     with pytest.raises(ConfinedError, match=r"time limit of 0\.5 s"):
         call(function, limits=Limits(seconds=0.5))
 
@@ -154,7 +154,7 @@ def test_calls_of_several_threads_do_not_wait_for_each_other(call, tmp_path):
         assert slow.result() == "done"
 
 
-def test_a_starter_that_was_ended_is_begun_again(call):
+def test_a_stopped_starter_is_restarted(call):
     call("double", x=1)
     process = starter._STARTER._process
     assert process is not None

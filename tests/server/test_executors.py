@@ -1,4 +1,4 @@
-"""Whoever does the tasks: each is done and told once, also after a worker has died."""
+"""Every executor does and reports each task once, even after a worker has died."""
 
 from __future__ import annotations
 
@@ -70,14 +70,14 @@ def test_what_the_caller_raises_ends_the_run():
         Processes(1).run(partial(Squares, None, False), TASKS, full)
 
 
-def test_executors_that_are_none_are_refused():
+def test_unknown_executors_are_refused():
     with pytest.raises(ExecutorError, match="allowed are processes, ray"):
         executor_of("threads", workers=2)
     with pytest.raises(ExecutorError, match="at least 1"):
         executor_of(EXECUTORS[0], workers=0)
 
 
-def test_without_ray_its_extra_is_named(monkeypatch):
+def test_a_missing_ray_is_reported_with_its_extra(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "ray", None)
     with pytest.raises(ExecutorError, match=r"real2sim\[ray\]"):
         RayCluster(1)

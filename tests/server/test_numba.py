@@ -217,7 +217,7 @@ def test_processes_that_need_a_kernel_at_once_compile_it_once(package):
     assert its_misses + other_misses == 1
 
 
-def test_a_process_of_low_priority_holds_nobody_up(package):
+def test_a_low_priority_process_does_not_block_others(package):
     change(package, "FACTOR = 2.0", "FACTOR = 3.0")
     slow = started(package, before=SLOW)
     try:
@@ -272,6 +272,6 @@ def test_changed_options_of_a_func_compile_anew(package):
     assert run(package) == (BEFORE, "compiled")
 
 
-def test_words_in_another_file_compile_nothing(package):
+def test_comments_in_another_file_do_not_recompile(package):
     change(package, '"""Documented."""', '"""Documented anew."""  # and why')
     assert run(package) == (BEFORE, "kept")

@@ -1,4 +1,4 @@
-"""One export of the tiny scene in all formats, which tests only read."""
+"""One export of the tiny scene in all formats, shared read-only by tests."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Labels of LiDAR points of a synthetic street against its rays."""
+"""LiDAR point labels of a synthetic street compared with its rays."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ IN_BOX = 0.1
 def judged_share(
     scene: Scene, log: SyntheticLog, lidar: Lidar, frames: Sequence[int]
 ) -> tuple[float, int]:
-    """Share of points with the right object and how many were judged.
+    """Share of points with the correct object, and how many were judged.
 
-    A point counts where the true ray about it meets one object only: no neighbouring ray within
-    EDGE_M of it sees another one.
+    A point counts if the true ray around it hits one object only: no neighbouring ray within
+    EDGE_M of it sees another.
     """
     drive = ScenarioDrive(scene, ScenarioState.of(scene))
     names = {o.object_id: o.instance_id for o in drive.state.tracks.at(0).objects}
@@ -73,7 +73,7 @@ def _truth(log: SyntheticLog, lidar: Lidar, t_us: int, names: dict[str, int]):
 
 
 def _away(points, instance, lidar: Lidar):
-    """Rays of which no other object is met within EDGE_M beside them."""
+    """Rays with no other object within EDGE_M beside them."""
     clear = np.ones(instance.shape, bool)
     reach = 6
     for down in range(-reach, reach + 1):

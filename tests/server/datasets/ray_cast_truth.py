@@ -1,4 +1,4 @@
-"""Labels of a synthetic street against its rays: figures for tests and documentation."""
+"""Labels of a synthetic street compared with its rays: figures for tests and documentation."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Figures:
     lengths: list[np.ndarray] = field(default_factory=list)
 
     def summary(self) -> dict[str, float]:
-        """The figures of the documentation."""
+        """The figures given in the documentation."""
         every = np.concatenate([np.array(v) for v in self.ious.values()])
         weights = np.concatenate([np.array(v) for v in self.pixels.values()])
         depth, flow = np.concatenate(self.depth), np.concatenate(self.flow)
@@ -65,7 +65,7 @@ class Figures:
 def measure(
     scene: Scene, frames: Sequence[int], cameras: Sequence[str], *, width: int | None = None
 ) -> Figures:
-    """Labels of the scene, trained on a synthetic drive, against that drive."""
+    """Compare labels of a scene trained on a synthetic drive with that drive."""
     log = generate_log(SyntheticConfig.from_values(scene.provenance["config"]))
     drive = ScenarioDrive(scene, ScenarioState.of(scene))
     rig = [scene.rig[name].resized(width or scene.rig[name].width) for name in cameras]
@@ -117,7 +117,7 @@ def _compare_objects(figures: Figures, log: SyntheticLog, view, truth, t_us: int
 
 
 def _alone(log: SyntheticLog, images, index: int, t_us: int) -> int:
-    """Pixels of a vehicle high above the street, seen from as high."""
+    """Pixels of a vehicle high above the street, seen from the same height."""
     source, camera = log.source, images.camera
     every = source.instances(t_us)
     one = every._replace(
@@ -143,7 +143,7 @@ def _alone(log: SyntheticLog, images, index: int, t_us: int) -> int:
 
 
 def _true_flow(log: SyntheticLog, here, there, truth, times_us):
-    """From rays and the drive's own tracks, written apart from what it judges."""
+    """From rays and the drive's own tracks, written independently of the code under test."""
     depth, instance = truth
     height, width = depth.shape
     v, u = np.mgrid[:height, :width] + 0.5

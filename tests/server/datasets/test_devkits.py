@@ -1,4 +1,4 @@
-"""Exports opened by their formats' own devkits, which the project does not depend on."""
+"""Exports opened with their formats' official devkits, which are not project dependencies."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_nuscenes_devkit_walks_from_scene_to_scene_through_all_samples(nusc):
     assert len(seen) == len(set(seen)) == len(nusc.sample) > 0
 
 
-def test_nuscenes_devkit_finds_boxes_in_the_frame_of_the_lidar(nusc, exported):
+def test_nuscenes_devkit_finds_boxes_in_the_lidar_frame(nusc, exported):
     frame = labels(exported)["frames"][0]
     (scene,) = (s for s in nusc.scene if s["name"] == "scene-0000")
     sample = nusc.get("sample", scene["first_sample_token"])
@@ -44,13 +44,13 @@ def test_nuscenes_devkit_finds_boxes_in_the_frame_of_the_lidar(nusc, exported):
     assert Path(path).is_file()
     assert len(boxes) == len(frame["objects"])
     for box, given in zip(boxes, frame["objects"], strict=True):
-        # The mount has no turn: what is left between the two frames is its place.
+        # The mount is not rotated: the two frames differ only in position.
         centre = box.center + mount["translation"]
         np.testing.assert_allclose(centre, np.array(given["T_ego_object"])[:3, 3], atol=1e-6)
         np.testing.assert_allclose(box.wlh[[1, 0, 2]], given["size"], atol=1e-9)
 
 
-def test_nuscenes_devkit_finds_every_pictures_boxes_before_its_camera(nusc):
+def test_nuscenes_devkit_finds_each_images_boxes_in_front_of_its_camera(nusc):
     cameras = [row for row in nusc.sample_data if row["sensor_modality"] == "camera"]
     assert len(cameras) == FRAMES * CAMERAS
     before = 0
@@ -75,7 +75,7 @@ def test_nuscenes_devkit_reads_a_class_and_an_instance_for_every_point(nusc, exp
             assert len(found) == classes.LidarPointCloud.from_file(str(path)).points.shape[1]
 
 
-def test_nuscenes_devkit_finds_the_speed_of_what_drives(nusc):
+def test_nuscenes_devkit_finds_the_speed_of_moving_objects(nusc):
     speeds = [np.linalg.norm(nusc.box_velocity(row["token"])) for row in nusc.sample_annotation]
     known = [speed for speed in speeds if np.isfinite(speed)]
     assert known
@@ -119,7 +119,7 @@ COMPONENTS = {
 
 @pytest.fixture(scope="module")
 def waymo(exported):
-    """Rows of the first clip, as the data set's own library makes objects of them."""
+    """Rows of the first clip, as objects of the dataset's own library."""
     v2 = pytest.importorskip("waymo_open_dataset.v2", reason="waymo-open-dataset is not installed")
     from pyarrow import parquet
 
@@ -131,7 +131,7 @@ def waymo(exported):
     return read
 
 
-def test_waymo_library_makes_objects_of_every_row(waymo, exported):
+def test_waymo_library_parses_every_row(waymo, exported):
     folders = {path.name for path in exported.glob("waymo/*/*") if path.is_dir()}
     assert folders == set(COMPONENTS)
     assert all(waymo(component) for component in COMPONENTS)

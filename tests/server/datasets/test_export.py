@@ -1,4 +1,4 @@
-"""The whole way: the same bytes always, after a kill too, and nothing half done."""
+"""End to end: always the same bytes, even after a kill, and nothing left half done."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ def contents(folder: Path) -> dict[str, str]:
 
 
 class Killed(BaseException):
-    """Nobody catches it, as nobody catches the end of a process."""
+    """Nothing catches it, just as nothing catches the death of a process."""
 
 
 @pytest.mark.parametrize(
     "stage", [("frames", 4), pytest.param(("formats", 3), marks=pytest.mark.slow)]
 )
-def test_a_stopped_export_goes_on_to_the_same_bytes(exported, tiny_drive, plan, tmp_path, stage):
+def test_a_stopped_export_resumes_to_the_same_bytes(exported, tiny_drive, plan, tmp_path, stage):
     labelled = []
 
     def stop(*progress) -> None:
@@ -55,7 +55,7 @@ def test_a_stopped_export_goes_on_to_the_same_bytes(exported, tiny_drive, plan, 
     assert not out.exists()
     export_dataset(tiny_drive, plan, out, on_progress=count)
     assert contents(out) == contents(exported)
-    # The clip that was whole is not drawn again.
+    # The clip that was complete is not rendered again.
     assert ("frames", 1) not in labelled
     assert not work_folder(out).exists()
 
@@ -69,7 +69,7 @@ def test_the_manifest_names_every_file_with_its_hash(exported):
     assert sorted({clip["split"] for clip in manifest["clips"].values()}) == ["train", "val"]
 
 
-def test_the_licence_of_the_source_is_carried_into_the_export(tiny_drive, plan, tmp_path):
+def test_the_export_includes_the_licence_of_the_source(tiny_drive, plan, tmp_path):
     terms = "CC BY-NC-SA 3.0 (Geiger et al. 2013)"
     provenance = {**tiny_drive.scene.provenance, "dataset": "KITTI", "licence": terms}
     drive = replace(tiny_drive, scene=replace(tiny_drive.scene, provenance=provenance))
@@ -79,7 +79,7 @@ def test_the_licence_of_the_source_is_carried_into_the_export(tiny_drive, plan, 
     assert json.loads((out / "manifest.json").read_text())["licence"] == terms
 
 
-def test_an_export_of_something_else_is_not_gone_on_with(tiny_drive, plan, tmp_path):
+def test_an_export_of_something_else_is_not_resumed(tiny_drive, plan, tmp_path):
     out = tmp_path / "out"
     work_folder(out).mkdir()
     (work_folder(out) / "digest").write_text("another")
@@ -98,18 +98,18 @@ def test_an_export_of_something_else_is_not_gone_on_with(tiny_drive, plan, tmp_p
         ({"period_us": 0}, "must be positive"),
     ],
 )
-def test_what_cannot_be_exported_is_refused(tiny_drive, plan, tmp_path, change, message):
+def test_invalid_exports_are_refused(tiny_drive, plan, tmp_path, change, message):
     with pytest.raises(DatasetError, match=message):
         export_dataset(tiny_drive, replace(plan, **change), tmp_path / "out")
     assert not list(tmp_path.iterdir())
 
 
-def test_a_folder_that_is_there_is_not_touched(tiny_drive, plan, tmp_path):
+def test_an_existing_folder_is_not_touched(tiny_drive, plan, tmp_path):
     with pytest.raises(DatasetError, match="exists already"):
         export_dataset(tiny_drive, plan, tmp_path)
 
 
-def test_splits_are_drawn_by_the_seed(tiny_drive, plan):
+def test_splits_depend_on_the_seed(tiny_drive, plan):
     long = replace(plan, end_us=2_000_000, clip_s=0.25, splits={"train": 0.75, "val": 0.25})
     drawn = [
         [clip.split for clip in planned_clips(tiny_drive, replace(long, seed=seed))]
@@ -119,7 +119,7 @@ def test_splits_are_drawn_by_the_seed(tiny_drive, plan):
     assert all(names.count("val") == 2 for names in drawn)
 
 
-def test_a_dry_run_says_how_much_there_will_be(tiny_drive, plan, exported):
+def test_a_dry_run_reports_the_amount_of_data(tiny_drive, plan, exported):
     guess = estimate(tiny_drive, plan)
     assert (guess.frames, guess.images) == (5, 10)
     written = sum(path.stat().st_size for path in exported.rglob("*") if path.is_file())
@@ -127,7 +127,7 @@ def test_a_dry_run_says_how_much_there_will_be(tiny_drive, plan, exported):
     assert guess.minutes > 0
 
 
-def test_the_command_exports_what_edits_have_made(tiny_scene, tmp_path):
+def test_the_command_exports_edited_scenes(tiny_scene, tmp_path):
     save_scene(tiny_scene, tmp_path / "tiny.r2s")
     edits = [{"op": "delete", "object_id": "car_blue"}]
     (tmp_path / "edits.json").write_text(json.dumps(edits))
@@ -148,7 +148,7 @@ def test_the_command_exports_what_edits_have_made(tiny_scene, tmp_path):
     assert manifest["made_of"] == {"operations": edits}
 
 
-def test_the_command_says_what_is_wrong_with_its_options(tiny_scene, tmp_path):
+def test_the_command_explains_invalid_options(tiny_scene, tmp_path):
     (tmp_path / "edits.json").write_text("[{}]")
     with pytest.raises(CommandError, match="allowed are shares such as"):
         command.export_dataset(scene=tmp_path, out=tmp_path, format_=["coco"], splits="train")
@@ -168,7 +168,7 @@ def recorded_episode(scene, tmp_path: Path) -> EpisodeDrive:
     return EpisodeDrive.of(made, saved)
 
 
-def test_an_episode_is_exported_as_it_went(tiny_scene, plan, tmp_path):
+def test_an_episode_is_exported_as_it_happened(tiny_scene, plan, tmp_path):
     drive = recorded_episode(tiny_scene, tmp_path)
     short = replace(plan, formats=("labels",), period_us=200_000, end_us=400_000, flow=False)
     out = export_dataset(drive, short, tmp_path / "out")
@@ -198,7 +198,7 @@ export_dataset(drive, plan, sys.argv[2], on_progress=die)
 
 @pytest.mark.slow
 @pytest.mark.parametrize("clips", [1, 3, 5])
-def test_a_killed_process_goes_on_to_the_same_bytes(tiny_scene, tmp_path, clips):
+def test_a_killed_process_resumes_to_the_same_bytes(tiny_scene, tmp_path, clips):
     save_scene(tiny_scene, tmp_path / "tiny.r2s")
 
     clips_folder = work_folder(tmp_path / "killed") / "clips"

@@ -1,4 +1,4 @@
-"""Keypoints of people: in the world, in images, and as COCO has them."""
+"""Keypoints of people: in the world, in images, and in COCO format."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ PLAN = ExportPlan(
 
 @pytest.fixture(scope="module")
 def drive(tiny_scene) -> ScenarioDrive:
-    """Somebody goes across the street ahead, to the left."""
+    """A person crosses the street ahead, to the left."""
     times = [0, 500_000, 1_000_000]
     track = {
         "times_us": times,
@@ -49,7 +49,7 @@ def frames(walked: Path) -> list[dict]:
     return json.loads((walked / "labels/0000/labels.json").read_text())["frames"]
 
 
-def test_keypoints_are_those_of_the_body_where_it_walks(drive):
+def test_keypoints_follow_the_walking_body(drive):
     subject = next(o for o in drive.placed_at(250_000).objects if o.asset is not None)
     (points,) = keypoints_at(drive.scene, drive.placed_at(250_000), 250_000).values()
     own = ANNA.figure.keypoints(subject.trajectory, 250_000)
@@ -67,7 +67,7 @@ def test_only_people_have_keypoints(walked):
             assert ("keypoints" in subject) == (subject["category"] == "pedestrian")
 
 
-def test_keypoints_that_are_seen_are_on_the_persons_pixels(walked):
+def test_visible_keypoints_lie_on_the_persons_pixels(walked):
     seen = 0
     for frame in frames(walked):
         (person,) = (v for v in frame["views"]["front"] if "keypoints_2d" in v)
@@ -80,7 +80,7 @@ def test_keypoints_that_are_seen_are_on_the_persons_pixels(walked):
     assert seen >= 3 * 8
 
 
-def test_the_far_side_of_a_person_is_hidden(walked):
+def test_keypoints_on_the_far_side_are_hidden(walked):
     hidden = {
         name
         for frame in frames(walked)
@@ -92,7 +92,7 @@ def test_the_far_side_of_a_person_is_hidden(walked):
     assert hidden != set(KEYPOINTS)
 
 
-def test_pycocotools_scores_keypoints_fed_as_detections_with_100(walked):
+def test_pycocotools_gives_keypoints_used_as_detections_a_perfect_score(walked):
     coco = pytest.importorskip("pycocotools.coco", exc_type=ImportError)
     evaluation = pytest.importorskip("pycocotools.cocoeval", exc_type=ImportError)
     truth = coco.COCO(str(walked / "coco/annotations/person_keypoints_train.json"))
@@ -108,5 +108,5 @@ def test_pycocotools_scores_keypoints_fed_as_detections_with_100(walked):
     assert run.stats[0] == 1.0
 
 
-def test_without_people_there_is_no_file_of_keypoints(exported):
+def test_no_keypoint_file_is_written_without_people(exported):
     assert not list((exported / "coco/annotations").glob("person_keypoints_*"))

@@ -1,4 +1,4 @@
-"""Labels by known answers."""
+"""Labels with known answers."""
 
 from __future__ import annotations
 
@@ -51,13 +51,13 @@ def box(x: float) -> ObjectBox:
     return ObjectBox("car_0", "car", 1, (4, 2, 2), pose(x, 0, 10), np.zeros(3))
 
 
-def test_box_of_a_cube_is_that_of_its_near_face():
+def test_the_box_of_a_cube_is_that_of_its_near_face():
     left, top, right, bottom = projected_box(pose(0, 0, 10), (2, 2, 2), CAMERA, np.eye(4))
     assert (left, right) == pytest.approx((48 - 60 / 9, 48 + 60 / 9))
     assert (top, bottom) == pytest.approx((32 - 60 / 9, 32 + 60 / 9))
 
 
-def test_box_that_reaches_behind_the_camera_is_cut_at_the_near_plane():
+def test_a_box_reaching_behind_the_camera_is_clipped_at_the_near_plane():
     left, _, right, _ = projected_box(pose(0, 0, 0), (2, 2, 10), CAMERA, np.eye(4))
     assert (left, right) == pytest.approx((48 - 600, 48 + 600))
     assert projected_box(pose(0, 0, -10), (2, 2, 2), CAMERA, np.eye(4)) is None
@@ -81,7 +81,7 @@ def test_flow_of_an_object_follows_its_pose():
     assert not gone.any()
 
 
-def test_what_comes_in_front_is_occluded():
+def test_flow_is_marked_occluded_when_something_comes_in_front():
     _, valid, occluded = flow_between(plane(10.0), plane(5.0), [], [])
     assert valid.all()
     assert occluded.all()
@@ -97,7 +97,7 @@ def test_flow_is_stored_to_a_128th_of_a_pixel():
     assert valid.tolist() == [[True, False]]
 
 
-def test_what_stands_behind_another_is_less_visible(tiny_scene, tiny_drive):
+def test_an_object_behind_another_is_less_visible(tiny_scene, tiny_drive):
     hidden = tiny_scene.objects["car_red"]
     front = tiny_scene.objects["car_blue"].trajectory.transform(0)[:3, 3]
     behind = Trajectory(np.array([0]), front[None] + [[6.0, 1.6, 0]], np.array([[1.0, 0, 0, 0]]))
@@ -122,7 +122,7 @@ def test_what_stands_behind_another_is_less_visible(tiny_scene, tiny_drive):
         ((1.9, 1.2, 0.0), False),
     ],
 )
-def test_between_its_wheels_a_vehicle_shows_its_shadow(place, own):
+def test_a_vehicles_shadow_shows_between_its_wheels(place, own):
     points = np.add([place], (0, 0, 10))
     assert on_surface(points, pose(0, 0, 10), box(0.0)).tolist() == [own]
 
@@ -131,20 +131,20 @@ def test_between_its_wheels_a_vehicle_shows_its_shadow(place, own):
     ("eye", "place", "own"),
     [
         ((0, 9, 0.7), (0.0, 0.3, -1.0), False),  # under the sill, on the road
-        ((0, 9, 0.7), (0.0, 0.3, -0.78), False),  # the road, thought too near
+        ((0, 9, 0.7), (0.0, 0.3, -0.78), False),  # the road, estimated too near
         ((0, 9, 0.7), (0.0, 0.85, -0.65), True),  # the sill
-        ((0, 9, 0.7), (0.0, 0.5, -0.7), True),  # the sill, thought too far
-        ((1.2, 9, 0.7), (1.2, 0.9, -0.98), True),  # a tyre where it stands
-        ((1.2, 9, 0.7), (1.2, 0.2, -1.0), True),  # a tyre, thought too far
-        ((1.2, 9, 0.7), (1.2, 1.4, -1.0), False),  # the road before the tyre
+        ((0, 9, 0.7), (0.0, 0.5, -0.7), True),  # the sill, estimated too far
+        ((1.2, 9, 0.7), (1.2, 0.9, -0.98), True),  # a tyre where it touches the road
+        ((1.2, 9, 0.7), (1.2, 0.2, -1.0), True),  # a tyre, estimated too far
+        ((1.2, 9, 0.7), (1.2, 1.4, -1.0), False),  # the road in front of the tyre
         ((12, 0, 0.7), (1.5, 0.0, -1.0), False),  # under the bumper
         ((12, 0.8, 0.7), (1.5, 0.8, -0.95), True),  # a front tyre below the bumper
         ((0, 9, 0.7), (0.0, 1.12, 0.0), True),  # a side that is a little too near
         ((9, 9, 0.7), (0.0, 1.3, 0.0), False),  # a wall beside it
-        ((30, 1.3, 0.7), (2.1, 1.12, 0.0), False),  # what is seen past the box
+        ((30, 1.3, 0.7), (2.1, 1.12, 0.0), False),  # what is visible past the box
     ],
 )
-def test_where_a_ray_comes_in_tells_a_vehicle_from_its_shadow(eye, place, own):
+def test_the_ray_entry_point_tells_a_vehicle_from_its_shadow(eye, place, own):
     ahead = np.subtract(place, eye, dtype=np.float64)
     rays = np.column_stack([np.zeros((3, 2)), ahead, np.add(eye, (0, 0, 10))])
     mask = np.empty((1, 1), np.bool_)
@@ -152,7 +152,7 @@ def test_where_a_ray_comes_in_tells_a_vehicle_from_its_shadow(eye, place, own):
     assert mask[0, 0] == own
 
 
-def test_ground_is_as_far_as_its_heights_say(tiny_scene, tiny_drive):
+def test_ground_depth_follows_the_ground_heights(tiny_scene, tiny_drive):
     moment = tiny_drive.at(0)
     (images,) = draw_moment(tiny_scene, moment, [tiny_scene.rig["front"]])
     points = back_projected(images.depth, images.camera.K, images.T_world_camera)
@@ -161,7 +161,7 @@ def test_ground_is_as_far_as_its_heights_say(tiny_scene, tiny_drive):
     np.testing.assert_allclose(shown[:, 2], tiny_scene.ground.height_at(shown[:, :2]), atol=5e-3)
 
 
-def test_futures_go_on_as_far_as_the_drive(tiny_drive):
+def test_futures_extend_to_the_end_of_the_drive(tiny_drive):
     rows = futures_at(tiny_drive, 1_000_000, ["car_blue"])["car_blue"]
     assert [row[0] for row in rows] == [0.5, 1.0]
     assert rows[1][1] == pytest.approx(28.0)

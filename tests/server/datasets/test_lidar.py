@@ -1,4 +1,4 @@
-"""Labelled points of LiDARs: every return says what it is of, and when."""
+"""Labelled LiDAR points: every return has its object and its time."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def objects(exported, frame: int = 0):
     ]
 
 
-def test_points_know_their_object_class_velocity_and_instant(exported):
+def test_points_have_object_class_velocity_and_time(exported):
     rows = points(exported)
     assert set(np.unique(rows["beam"])) <= {0, 1, 2, 3}
     assert rows["time_us"].min() < 0 < rows["time_us"].max()
@@ -66,7 +66,7 @@ def test_points_know_their_object_class_velocity_and_instant(exported):
             np.testing.assert_allclose(own["velocity"].mean(0), subject["velocity_ego"], atol=0.05)
 
 
-def test_points_of_an_object_are_in_its_box(exported):
+def test_points_of_an_object_lie_in_its_box(exported):
     rows = points(exported)
     counted = 0
     for subject in objects(exported):
@@ -103,7 +103,7 @@ def test_nuscenes_has_a_class_and_a_panoptic_label_for_every_point(exported):
         assert (classes[rows["semantic"] == GROUND] == index["flat.driveable_surface"]).all()
 
 
-def test_an_episode_is_swept_as_it_moves(tiny_scene, tmp_path):
+def test_sweeps_follow_the_motion_in_an_episode(tiny_scene, tmp_path):
     drive = recorded_episode(tiny_scene, tmp_path)
     lidar = planned_lidar(PLAN)
     met: MetSweep = drive.sweep_at(lidar, 200_000)
@@ -115,7 +115,7 @@ def test_an_episode_is_swept_as_it_moves(tiny_scene, tmp_path):
 
 
 def truth_of(columns: int):
-    """The demo's street, its sensor with so many columns, and its rays."""
+    """The demo street, its sensor with that many columns, and its rays."""
     scene = read_packed(SHIPPED)
     values = {
         **SMALL,
@@ -130,14 +130,14 @@ def truth_of(columns: int):
     return scene, log, planned_lidar(replace(PLAN, lidar=values))
 
 
-def test_labels_of_points_agree_with_rays_away_from_edges():
+def test_point_labels_agree_with_rays_away_from_edges():
     share, judged = judged_share(*truth_of(512), [10])
     assert judged > 3000
     assert share > 0.99
 
 
 @pytest.mark.slow
-def test_labels_of_points_of_the_whole_drive_agree_with_rays():
+def test_point_labels_of_the_whole_drive_agree_with_rays():
     share, judged = judged_share(*truth_of(1024), range(1, 54, 6))
     print(share, judged)
     assert judged > 50_000

@@ -1,4 +1,4 @@
-"""Whoever makes the clips: the same bytes, also after one of the makers has died."""
+"""Clips have the same bytes whichever executor makes them, even after a worker has died."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ DIES_AT = 750_000
 
 
 class DyingDrive(ScenarioDrive):
-    """Whoever looks at a certain instant first dies of it."""
+    """The first process to read a certain instant dies."""
 
     mark: Path
 
@@ -81,12 +81,12 @@ def made_by(name: str, scene_file: Path, out: Path, *, mark: Path | None = None,
 
 
 @pytest.mark.slow
-def test_two_processes_give_the_bytes_of_one(scene_file, alone, tmp_path):
+def test_two_processes_give_the_same_bytes_as_one(scene_file, alone, tmp_path):
     assert made_by("processes", scene_file, tmp_path / "out") == alone
 
 
 @pytest.mark.slow
-def test_clips_of_a_process_that_dies_are_made_again(scene_file, alone, tmp_path):
+def test_clips_of_a_dead_process_are_made_again(scene_file, alone, tmp_path):
     mark = tmp_path / "died"
     assert made_by("processes", scene_file, tmp_path / "out", mark=mark) == alone
     assert mark.exists()
@@ -95,7 +95,9 @@ def test_clips_of_a_process_that_dies_are_made_again(scene_file, alone, tmp_path
 @pytest.mark.ray
 @pytest.mark.slow
 @pytest.mark.parametrize("dies", [False, True])
-def test_ray_gives_the_bytes_of_one_process_also_when_one_dies(scene_file, alone, tmp_path, dies):
+def test_ray_gives_the_same_bytes_as_one_process_even_if_a_worker_dies(
+    scene_file, alone, tmp_path, dies
+):
     pytest.importorskip("ray")
     mark = tmp_path / "died" if dies else None
     assert made_by("ray", scene_file, tmp_path / "out", mark=mark) == alone

@@ -1,4 +1,4 @@
-"""Our own exports are logs like others: a scene is built from them again."""
+"""Our own exports are logs like any other: a scene can be rebuilt from them."""
 
 from __future__ import annotations
 

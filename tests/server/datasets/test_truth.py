@@ -1,4 +1,4 @@
-"""Labels of the demo's street against rays through it; docs/datasets.md has the figures."""
+"""Labels of the demo street compared with rays; the figures are in docs/datasets.md."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sweeps, starts beside the path, errors of a detector, and rigs of one's own."""
+"""Sweeps, starts beside the path, detector errors and custom rigs."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def variants(drive, sweep=SWEEP, seed: int = 0):
     return swept(drive.scene, drive.state, sweep, seed)
 
 
-def test_a_sweep_is_every_combination_with_draws_of_its_own(tiny_drive):
+def test_a_sweep_has_every_combination_with_its_own_draws(tiny_drive):
     found = variants(tiny_drive)
     assert [v.values["ahead"] for v in found] == [0.0, 0.0, 2.0, 2.0, 4.0, 4.0]
     assert len({v.values["beside"] for v in found}) == 6
@@ -63,7 +63,7 @@ def test_a_sweep_is_every_combination_with_draws_of_its_own(tiny_drive):
         np.testing.assert_allclose(moved, [variant.values["ahead"], variant.values["beside"]])
 
 
-def test_draws_are_those_of_the_seed(tiny_drive):
+def test_draws_depend_on_the_seed(tiny_drive):
     drawn = [[v.values["beside"] for v in variants(tiny_drive, seed=s)] for s in (1, 1, 2)]
     assert drawn[0] == drawn[1] != drawn[2]
 
@@ -76,12 +76,12 @@ def test_draws_are_those_of_the_seed(tiny_drive):
         ({"draws": 500}, "1500 variants; 1000 is the most"),
     ],
 )
-def test_a_sweep_that_makes_no_sense_is_refused(tiny_drive, change, message):
+def test_invalid_sweeps_are_refused(tiny_drive, change, message):
     with pytest.raises(DatasetError, match=message):
         variants(tiny_drive, SWEEP.model_copy(update=change))
 
 
-def test_all_variants_of_a_stretch_are_in_one_split(tiny_drive):
+def test_all_variants_of_a_segment_are_in_one_split(tiny_drive):
     plan = replace(PLAN, end_us=2_000_000, splits={"train": 0.5, "val": 0.5})
     shards = planned_shards(variants(tiny_drive), replace(plan, perturb=Perturbation(copies=2)))
     assert [shard.name for shard in shards] == [f"{k:04d}" for k in range(len(shards))]
@@ -93,7 +93,7 @@ def test_all_variants_of_a_stretch_are_in_one_split(tiny_drive):
     assert set.union(*splits.values()) == {"train", "val"}
 
 
-def test_an_ego_beside_its_path_finds_back_to_it(tiny_drive):
+def test_an_ego_beside_its_path_returns_to_it(tiny_drive):
     drive = PerturbedDrive.beside(tiny_drive, 0, 1.0, 0.1, 1.5)
     assert drive.offset_at(0) == pytest.approx((1.0, 0.1))
     assert drive.offset_at(2_000_000) == pytest.approx((0.0, 0.0), abs=1e-6)
@@ -101,20 +101,20 @@ def test_an_ego_beside_its_path_finds_back_to_it(tiny_drive):
     steps = np.diff(poses[:, :2, 3], axis=0)
     ways = np.arctan2(steps[:, 1], steps[:, 0])
     turns = np.arctan2(poses[1:, 1, 0], poses[1:, 0, 0])
-    # It looks where it goes, and turns as a car can.
+    # It faces where it drives, and turns as a car can.
     np.testing.assert_allclose(ways, turns, atol=0.01)
     curvature = np.abs(np.diff(ways)) / np.linalg.norm(steps[1:], axis=1)
     assert curvature.max() < 0.2
 
 
-def test_the_future_of_an_ego_beside_its_path_is_the_way_back(tiny_drive):
+def test_the_future_of_an_ego_beside_its_path_leads_back(tiny_drive):
     drive = PerturbedDrive.beside(tiny_drive, 0, 1.0, 0.0, 1.5)
     last = ego_future(drive, 0)[-1]
     assert last[2] == pytest.approx(-1.0, abs=0.02)
     assert last[3] == pytest.approx(0.0, abs=0.01)
 
 
-def test_a_start_on_another_vehicle_is_drawn_again(tiny_drive):
+def test_a_start_on_another_vehicle_is_redrawn(tiny_drive):
     wide = Perturbation(lateral_sigma=5.0, heading_sigma=0.0)
     found = [perturbed(tiny_drive, wide, (0, 500_000), (0, k)) for k in range(12)]
     again = [perturbed(tiny_drive, wide, (0, 500_000), (0, k)) for k in range(12)]
@@ -127,7 +127,7 @@ def test_a_start_on_another_vehicle_is_drawn_again(tiny_drive):
         assert abs(away[1, 3]) > 1.5 or abs(away[0, 3]) > 3.0
 
 
-def test_perturbed_clips_of_a_sweep_carry_what_they_are(tiny_drive, tmp_path):
+def test_perturbed_clips_record_their_variant(tiny_drive, tmp_path):
     noise = BoxNoise(position=0.3, false=2.0)
     one = replace(PLAN, end_us=0, perturb=Perturbation(), noise=noise)
     chosen = variants(tiny_drive)[:2]
@@ -144,7 +144,7 @@ def test_perturbed_clips_of_a_sweep_carry_what_they_are(tiny_drive, tmp_path):
     assert found >= {o["object_id"] for o in clip.frames[0]["objects"]}
 
 
-def test_a_detector_errs_as_much_as_it_is_told_to(tiny_drive):
+def test_a_detector_makes_the_requested_errors(tiny_drive):
     boxes = boxes_at(tiny_drive.placed_at(0))
     poses = [box.T_world_object for box in boxes]
     noise = BoxNoise(position=0.5, heading=0.1, missed=0.25, false=1.5)
@@ -170,7 +170,7 @@ RIG = {
 }
 
 
-def test_a_rig_has_cameras_of_its_own(tiny_drive):
+def test_a_custom_rig_has_its_own_cameras(tiny_drive):
     plan = replace(PLAN, cameras=(), width=None, rig=RIG)
     front, wide = planned_cameras(tiny_drive, plan)
     assert front.width == 48
@@ -190,12 +190,12 @@ def test_a_rig_has_cameras_of_its_own(tiny_drive):
         ([{"name": "front", "hfov_deg": 300.0}], "hfov_deg"),
     ],
 )
-def test_a_rig_that_makes_no_sense_is_refused(tiny_drive, cameras, message):
+def test_invalid_rigs_are_refused(tiny_drive, cameras, message):
     with pytest.raises(DatasetError, match=message):
         planned_cameras(tiny_drive, replace(PLAN, cameras=(), rig={"cameras": cameras}))
 
 
-def test_options_of_starts_and_noise_say_what_is_allowed():
+def test_invalid_start_and_noise_options_state_what_is_allowed():
     found = command._perturbation("lateral=1,heading=8,copies=3")
     assert (found.lateral_sigma, found.copies) == (1.0, 3)
     assert found.heading_sigma == pytest.approx(math.radians(8))

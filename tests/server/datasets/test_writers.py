@@ -1,4 +1,4 @@
-"""What every writer promises, and each format by a reader that shares nothing with its writer."""
+"""The writer contract, and each format checked by a reader that shares no code with its writer."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def tables(exported: Path) -> dict[str, list[dict]]:
 
 
 @pytest.mark.parametrize("writer", WRITERS, ids=lambda w: w.name)
-def test_a_writer_fills_its_folder_and_says_what_with(exported, writer):
+def test_a_writer_fills_its_folder_and_lists_the_files(exported, writer):
     files = [path for path in (exported / writer.name).rglob("*") if path.is_file()]
     assert files
     assert all(path.stat().st_size for path in files if path.suffix != ".txt")
@@ -73,7 +73,7 @@ def boxes_of_log(log, t_us: int):
         ("waymo", None),
     ],
 )
-def test_our_own_reader_finds_every_box_where_it_is(exported, folder, sequence):
+def test_our_own_reader_finds_every_box_in_place(exported, folder, sequence):
     log = open_first_clip(exported, folder, sequence)
     frame = labels(exported)["frames"][0]
     first = np.array(frame["T_world_ego"])
@@ -110,13 +110,13 @@ def test_our_own_reader_finds_camera_images_and_points(exported, tiny_scene, fol
     points = np.load(exported / "labels/0000/points/000000.npy")
     found = log.lidar(0).points
     assert found.shape == points["xyz"].shape
-    # Range images have an order of their own.
+    # Range images have their own order.
     away, nearest = KDTree(found).query(points["xyz"])
     assert away.max() < 1e-4
     assert len(np.unique(nearest)) == len(found)
 
 
-def test_kitti_object_rows_have_fifteen_columns_of_what_is_seen(exported):
+def test_kitti_object_rows_have_fifteen_columns_for_visible_objects(exported):
     rows = (exported / "kitti/object/training/label_2/000000.txt").read_text().splitlines()
     seen = [v for v in labels(exported)["frames"][0]["views"]["front"] if v["box_2d_modal"]]
     assert len(rows) == len(seen) > 0
@@ -127,7 +127,7 @@ def test_kitti_object_rows_have_fifteen_columns_of_what_is_seen(exported):
         np.testing.assert_allclose([float(word) for word in words[4:8]], box)
 
 
-def test_nuscenes_has_no_token_that_leads_nowhere(exported):
+def test_nuscenes_has_no_dangling_tokens(exported):
     found = tables(exported)
     assert len(found) == 15
     tokens = {name: {row["token"] for row in rows} for name, rows in found.items()}
@@ -141,7 +141,7 @@ def test_nuscenes_has_no_token_that_leads_nowhere(exported):
                     assert {v for v in given if v} <= everywhere, (key, row)
 
 
-def test_nuscenes_lists_are_linked_and_files_there(exported):
+def test_nuscenes_lists_are_linked_and_files_exist(exported):
     found = tables(exported)
     rows = {row["token"]: row for row in found["sample_data"]}
     assert len(rows) == FRAMES * (CAMERAS + 1)
@@ -191,7 +191,7 @@ def test_coco_masks_are_the_pixels_of_their_objects(exported):
 
 @pytest.fixture(scope="module")
 def exports(tiny_scene, tmp_path_factory):
-    """Exports of scenes whose objects are of the categories given, by the command."""
+    """Exports by the command of scenes whose objects have the given categories."""
     folder = tmp_path_factory.mktemp("categories")
 
     def export(*categories: str) -> Path:
@@ -213,7 +213,7 @@ def exports(tiny_scene, tmp_path_factory):
     return export
 
 
-def test_ids_of_categories_do_not_depend_on_which_are_there(exports):
+def test_category_ids_do_not_depend_on_which_are_present(exports):
     found = []
     for folder in (exports("cyclist", "kiosk", "car"), exports("cyclist", "kiosk")):
         kinds = ("instances", "panoptic")
@@ -235,7 +235,7 @@ def test_ids_of_categories_do_not_depend_on_which_are_there(exports):
     assert (lidarseg["vehicle.car"], lidarseg["flat.driveable_surface"]) == (17, 24)
 
 
-def test_pycocotools_scores_labels_fed_as_detections_with_100(exported):
+def test_pycocotools_gives_labels_used_as_detections_a_perfect_score(exported):
     coco = pytest.importorskip("pycocotools.coco", exc_type=ImportError)
     evaluation = pytest.importorskip("pycocotools.cocoeval", exc_type=ImportError)
     truth = coco.COCO(str(exported / "coco/annotations/instances_train.json"))
@@ -262,7 +262,7 @@ def test_coco_panoptic_png_holds_its_segments(exported):
     assert {segment["category_id"] for segment in row["segments_info"]} <= known
 
 
-def test_webdataset_keeps_the_files_of_a_sample_together(exported):
+def test_webdataset_groups_the_files_of_a_sample(exported):
     shards = sorted((exported / "webdataset").glob("*.tar"))
     assert [path.name for path in shards] == ["train-000000.tar", "val-000000.tar"]
     keys = []
@@ -300,7 +300,7 @@ def waymo(exported: Path, component: str) -> dict[str, list]:
     return pq.read_table(path).to_pydict()
 
 
-def test_waymo_has_what_is_seen_with_its_boxes_and_masks(exported):
+def test_waymo_has_visible_objects_with_boxes_and_masks(exported):
     frame = labels(exported)["frames"][0]
     given = {v["object_id"]: v["box_2d_modal"] for v in frame["views"]["front"]}
     rows, name = waymo(exported, "camera_box"), "[CameraBoxComponent].box"
@@ -322,7 +322,7 @@ def test_waymo_has_what_is_seen_with_its_boxes_and_masks(exported):
     assert (label[shown > 0] // 1000 == 2).any()
 
 
-def test_waymo_says_which_object_a_point_is_of(exported):
+def test_waymo_points_name_their_object(exported):
     points = np.load(exported / "labels/0000/points/000000.npy")
     rows = waymo(exported, "lidar_segmentation")
     name = "[LiDARSegmentationLabelComponent].range_image_return1"
@@ -338,7 +338,7 @@ def ncore_store(exported: Path) -> Path:
     return next(exported.glob("ncore/*/*_0000.ncore4.zarr"))
 
 
-def test_ncore_holds_metadata_of_everything_once_more(exported):
+def test_ncore_has_consolidated_metadata(exported):
     cbor2 = pytest.importorskip("cbor2")
     root = ncore_store(exported)
     content = cbor2.loads(lzma.decompress((root / ".zmetadata.cbor.xz").read_bytes()))
@@ -350,7 +350,7 @@ def test_ncore_holds_metadata_of_everything_once_more(exported):
         assert kept == json.loads(path.read_text())
 
 
-def test_ncore_stores_hold_arrays_as_zarr_says(exported):
+def test_ncore_stores_are_valid_zarr(exported):
     frame = labels(exported)["frames"][1]
     here = ncore_store(exported) / "lidars/lidar_top/frames" / str(frame["t_us"] + 1_000_000)
     points = np.load(exported / "labels/0000/points/000001.npy")
@@ -367,7 +367,7 @@ def test_ncore_stores_hold_arrays_as_zarr_says(exported):
     assert (array(here / "generic_data/instance") == points["instance"]).all()
 
 
-def test_ncores_own_reader_opens_ours(exported, tiny_scene):
+def test_ncores_own_reader_opens_our_export(exported, tiny_scene):
     v4 = pytest.importorskip("ncore.data.v4")
     reader = v4.SequenceComponentGroupsReader([ncore_store(exported)])
     frame = labels(exported)["frames"][0]

@@ -19,12 +19,12 @@ class Worker:
             raise ReplyTimeoutError("ready worker", timeout, hint="warming up kernels")
 
 
-def test_a_long_start_is_explained_by_what_the_worker_does(capsys):
+def test_a_slow_start_is_explained_by_worker_progress(capsys):
     wait_ready(Worker(refusals=1))
     assert "warming up kernels" in capsys.readouterr().err
 
 
-def test_a_quick_start_needs_no_words(capsys):
+def test_a_quick_start_prints_nothing(capsys):
     wait_ready(Worker(refusals=0))
     assert capsys.readouterr().err == ""
 

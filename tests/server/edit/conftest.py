@@ -1,4 +1,4 @@
-"""A small street without Gaussians: what scenarios are edited on."""
+"""A small street without Gaussians, on which scenarios are edited."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def state(summary: SimpleNamespace) -> ScenarioState:
 
 @pytest.fixture(scope="session")
 def state_with_assets(summary: SimpleNamespace) -> ScenarioState:
-    """The same, beside a library that holds a van."""
+    """The same, with an asset library that contains a van."""
     van = SimpleNamespace(
         asset_id="van", category="truck", size=(5.0, 2.1, 2.0), gaussians=7, figure=None
     )

@@ -41,13 +41,13 @@ def test_translate_in_the_world_shifts_every_position(state):
 def test_translate_in_the_object_frame_turns_with_the_object(state):
     moved = after(state, Translate(object_id="turning", y=2, frame="object"))
 
-    # The circle of radius 15 m about (40, 25): two metres to the left is two metres inwards.
+    # A circle of radius 15 m about (40, 25): two metres to the left is two metres inwards.
     radii = np.linalg.norm(moved.trajectory.positions[:, :2] - [40, 25], axis=1)
     np.testing.assert_allclose(radii, 13)
 
 
 @pytest.mark.parametrize("frame", ["world", "object"])
-def test_rotate_turns_about_the_own_centre(state, frame):
+def test_rotate_turns_about_the_objects_own_centre(state, frame):
     turned = after(state, Rotate(object_id="turning", angle=np.pi / 2, frame=frame))
 
     old, new = transforms(state.objects["turning"]), transforms(turned)
@@ -59,7 +59,7 @@ ANGLE = 0.7
 
 
 def slips(trajectory) -> np.ndarray:
-    """Angles between way and heading [rad], of what moves on a plane."""
+    """Angles between direction of travel and heading [rad], for motion in a plane."""
     way = np.diff(trajectory.positions[:, :2], axis=0)
     headings = quaternion_yaw(trajectory.quaternions)
     off = np.arctan2(way[:, 1], way[:, 0]) - (headings[1:] + headings[:-1]) / 2
@@ -83,7 +83,7 @@ def test_a_rotation_about_an_instant_turns_the_path(state, name, frame):
     np.testing.assert_allclose(back.positions, before.positions, atol=1e-9)
 
 
-def test_a_rotation_from_an_instant_on_turns_the_rest_of_the_path(state):
+def test_a_rotation_from_an_instant_turns_the_rest_of_the_path(state):
     before = state.objects["crossing"].trajectory
     when = TimeRange(start_us=800_000, blend_us=400_000)
     turned = apply_operations(
@@ -97,7 +97,7 @@ def test_a_rotation_from_an_instant_on_turns_the_rest_of_the_path(state):
     assert "sideways" not in {w.code for w in turned.warnings}
 
 
-def test_who_goes_sideways_is_warned_of(state):
+def test_sideways_motion_gives_a_warning(state):
     for name, warned in (("crossing", True), ("turning", True), ("parked", False)):
         rotation = Rotate(object_id=name, angle=np.radians(42))
         found = {w.code: w.message for w in apply_operations(state, [rotation]).warnings}
@@ -106,7 +106,7 @@ def test_who_goes_sideways_is_warned_of(state):
             assert f"{name!r} goes sideways, up to 42 degrees" in found["sideways"]
 
 
-def test_rotate_about_a_world_axis_differs_from_the_objects_own(state):
+def test_rotating_about_a_world_axis_differs_from_the_objects_own(state):
     operation = Rotate(object_id="crossing", angle=np.pi / 2, axis=(2, 0, 0))
     world = transforms(after(state, operation, of="crossing"))[0]
     own_axis = operation.model_copy(update={"frame": "object"})
@@ -137,7 +137,7 @@ def test_scales_multiply(state):
     assert after(state, *twice, of="parked").scale == (4, 9, 1)
 
 
-def test_scales_that_run_away_are_refused(state):
+def test_excessive_scales_are_refused(state):
     with pytest.raises(EditError, match=r"0\.001 to 1000 is allowed") as refused:
         apply_operations(state, [Scale(object_id="parked", x=100)] * 2)
 
@@ -145,7 +145,7 @@ def test_scales_that_run_away_are_refused(state):
     assert refused.value.index == 1
 
 
-def test_set_pose_stands_for_the_whole_time_range(state):
+def test_set_pose_applies_to_the_whole_time_range(state):
     pose = Pose(position=(1, 2, 3), quaternion=(0, 0, 0, 1))
     stood = after(state, SetPose(object_id="late", pose=pose), of="late").trajectory
 
@@ -166,7 +166,7 @@ def test_set_trajectory_replaces_the_motion(state):
     assert not moved.covers(1_000_001)
 
 
-def test_set_trajectory_that_does_not_fit_is_refused_with_its_place(state):
+def test_an_invalid_trajectory_is_refused_with_its_location(state):
     track = Track.model_construct(
         times_us=[0, 0], positions=[(0, 0, 0)] * 2, quaternions=[(1, 0, 0, 0)] * 2
     )
@@ -174,7 +174,7 @@ def test_set_trajectory_that_does_not_fit_is_refused_with_its_place(state):
         apply_operations(state, [SetTrajectory.model_construct(object_id="late", trajectory=track)])
 
 
-def test_duplicate_is_a_shifted_copy_with_an_instance_of_its_own(state):
+def test_duplicate_is_a_shifted_copy_with_its_own_instance(state):
     outcome = apply_operations(state, [Duplicate(object_id="late", x=5)])
     copy, original = outcome.state.objects["late_copy1"], state.objects["late"]
 
@@ -191,7 +191,7 @@ def test_copies_of_copies_show_the_same_source(state):
     assert after(state, *copies, of="third").source_id == "late"
 
 
-def test_default_ids_of_copies_skip_taken_ones_even_deleted(state):
+def test_default_copy_ids_skip_taken_ones_even_if_deleted(state):
     outcome = apply_operations(
         state,
         [
@@ -230,7 +230,7 @@ def test_a_deleted_object_is_a_tombstone(state):
     assert "parked" not in [o.object_id for o in gone.visible]
 
 
-def test_restore_brings_a_deleted_object_back_as_it_was(state):
+def test_restore_brings_a_deleted_object_back_unchanged(state):
     moved = apply_operations(state, [Translate(object_id="parked", x=1)]).state
     gone = apply_operations(moved, [Delete(object_id="parked")]).state
     back = apply_operations(gone, [Restore(object_id="parked")]).state.objects["parked"]
@@ -243,7 +243,7 @@ def test_restore_brings_a_deleted_object_back_as_it_was(state):
     "operation",
     [Translate(object_id="parked"), Delete(object_id="parked"), Duplicate(object_id="parked")],
 )
-def test_editing_a_deleted_object_is_refused_with_what_to_do(state, operation):
+def test_editing_a_deleted_object_is_refused_with_a_remedy(state, operation):
     gone = apply_operations(state, [Delete(object_id="parked")]).state
 
     with pytest.raises(EditError, match="'parked' is deleted") as refused:
@@ -253,7 +253,7 @@ def test_editing_a_deleted_object_is_refused_with_what_to_do(state, operation):
     assert "restore" in refused.value.hint
 
 
-def test_restoring_an_object_that_is_there_is_refused(state):
+def test_restoring_an_existing_object_is_refused(state):
     with pytest.raises(EditError, match="not deleted"):
         apply_operations(state, [Restore(object_id="parked")])
 
@@ -266,7 +266,7 @@ def test_unknown_ids_are_refused_with_the_known_ones(state):
     assert refused.value.hint == "objects of this scenario: parked, crossing, turning"
 
 
-def test_objects_cannot_leave_what_the_wire_can_carry(state):
+def test_objects_cannot_leave_the_range_of_the_protocol(state):
     with pytest.raises(EditError, match="1e\\+06 m is allowed"):
         apply_operations(state, [Translate(object_id="parked", x=1e6)])
 
@@ -279,7 +279,7 @@ def test_a_scene_and_its_summary_give_the_same_state(summary, state):
     assert [o.instance_id for o in state.objects.values()] == [1, 2, 3, 4]
 
 
-def test_a_scenario_has_so_many_objects_at_most_and_deleted_ones_do_not_count(state, monkeypatch):
+def test_the_object_limit_does_not_count_deleted_objects(state, monkeypatch):
     present = sum(not found.deleted for found in state.objects.values())
     monkeypatch.setattr("real2sim_server.edit.apply.MAX_OBJECTS", present + 1)
     full = apply_operations(state, [Duplicate(object_id="parked", x=9)]).state
@@ -292,7 +292,7 @@ def test_a_scenario_has_so_many_objects_at_most_and_deleted_ones_do_not_count(st
     assert len(apply_operations(full, room).created) == 1
 
 
-def test_a_log_from_before_the_limit_is_replayed_whole(state, monkeypatch):
+def test_a_log_from_before_the_limit_is_fully_replayed(state, monkeypatch):
     monkeypatch.setattr("real2sim_server.edit.apply.MAX_OBJECTS", 1)
     after = replay_operations(state, [Duplicate(object_id="parked", x=9)])
     assert "parked_copy1" in after.objects

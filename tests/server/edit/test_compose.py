@@ -41,7 +41,7 @@ def test_the_background_comes_first_and_is_not_copied(street):
     assert instances[0].instance_id == 0
 
 
-def test_objects_stand_where_their_trajectory_says(street):
+def test_objects_are_placed_by_their_trajectories(street):
     state = ScenarioState.of(street)
     instances = instances_at(street, state, 2_150_000)
 
@@ -58,7 +58,7 @@ def test_objects_outside_their_time_range_are_left_out(street):
     assert ids == [0, 1, 2, 3]
 
 
-def test_edits_show(street):
+def test_edits_are_visible(street):
     edited = apply_operations(
         ScenarioState.of(street),
         [
@@ -85,11 +85,11 @@ def shadows(instances):
     return [i for i in instances[1:] if i.instance_id == 0]
 
 
-def test_recorded_objects_cast_no_second_shadow(street):
+def test_recorded_objects_do_not_cast_a_second_shadow(street):
     assert shadows(instances_at(street, ScenarioState.of(street), 0)) == []
 
 
-def test_a_moved_object_has_a_shadow_of_its_footprint_on_the_ground(street):
+def test_a_moved_object_casts_a_shadow_of_its_footprint(street):
     state = ScenarioState.of(street)
     moved = apply_operations(state, [Translate(object_id="parked", x=-6, y=-3)]).state
     (shadow,) = shadows(instances_at(street, moved, 0))
@@ -98,7 +98,7 @@ def test_a_moved_object_has_a_shadow_of_its_footprint_on_the_ground(street):
     np.testing.assert_allclose(shadow.scale, [4.7, 2.7, 1.0])
 
 
-def test_an_object_moved_back_has_none(street):
+def test_an_object_moved_back_has_no_added_shadow(street):
     there = Translate(object_id="parked", x=-6)
     back = Translate(object_id="parked", x=6)
     state = apply_operations(ScenarioState.of(street), [there, back]).state
@@ -106,7 +106,7 @@ def test_an_object_moved_back_has_none(street):
     assert shadows(instances_at(street, state, 0)) == []
 
 
-def test_a_shadow_pales_as_its_object_rises_and_then_is_gone(street):
+def test_a_shadow_fades_and_disappears_as_its_object_rises(street):
     def darkness(height: float) -> float:
         lift = Translate(object_id="parked", x=-6, z=height)
         state = apply_operations(ScenarioState.of(street), [lift]).state
@@ -126,7 +126,7 @@ def test_erased_regions_hide_their_gaussians_and_share_the_rest(street):
     assert instances_at(street, state, 100)[0].cloud is shown
 
 
-def test_uncertainties_stay_with_objects_that_move_and_with_their_copies(tiny_scene):
+def test_moved_objects_and_copies_keep_their_uncertainties(tiny_scene):
     red = tiny_scene.object("car_red")
     known = replace(red.cloud, uncertainties=torch.full((len(red.cloud),), 0.1))
     objects = dict(tiny_scene.objects) | {"car_red": replace(red, cloud=known)}

@@ -1,4 +1,4 @@
-"""How an edit lets a person walk."""
+"""Edits that change how a person walks."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def walked(state, **gait):
     return apply_operations(state, [SetGait(object_id="a", **gait)])
 
 
-def test_a_person_walks_as_told_and_as_before_when_it_is_taken_back(tiny_scene, state):
+def test_a_gait_edit_changes_the_walk_and_undo_restores_it(tiny_scene, state):
     changed = walked(state, stride=0.7, lean=0.2)
     figure = figure_of(tiny_scene, changed.state.objects["a"])
     assert (figure.style.stride, figure.style.lean, figure.style.arms) == (0.7, 0.2, 1.0)
@@ -45,23 +45,23 @@ def test_a_person_walks_as_told_and_as_before_when_it_is_taken_back(tiny_scene, 
     assert torch.equal(drawn(tiny_scene, back), drawn(tiny_scene, state))
 
 
-def test_the_same_gait_is_the_same_figure(tiny_scene, state):
+def test_equal_gaits_share_a_figure(tiny_scene, state):
     one, other = (walked(state, arms=2.0).state.objects["a"] for _ in range(2))
     assert figure_of(tiny_scene, one) is figure_of(tiny_scene, other)
 
 
-def test_a_snapshot_keeps_it(tiny_scene, state):
+def test_a_snapshot_keeps_the_gait(tiny_scene, state):
     changed = walked(state, width=2.0).state
     again = unpack_state(state, pack_state(changed))
     assert again.objects["a"].gait == changed.objects["a"].gait
 
 
-def test_who_does_not_walk_has_no_gait(state):
+def test_only_people_who_walk_have_a_gait(state):
     with pytest.raises(EditError, match="does not walk"):
         apply_operations(state, [SetGait(object_id="car_red", stride=1.1)])
 
 
 @pytest.mark.parametrize("gait", [{"stride": 3.0}, {"lean": 2.0}, {"phase": 2}])
-def test_nobody_walks_beyond_what_legs_can(gait):
+def test_impossible_gaits_are_refused(gait):
     with pytest.raises(ValueError, match=next(iter(gait))):
         SetGait(object_id="a", **gait)

@@ -1,4 +1,4 @@
-"""Ground where a parked object was."""
+"""Ground under removed parked objects."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ def state(tiny_scene) -> ScenarioState:
     "operation",
     [Delete(object_id=PARKED), Translate(object_id=PARKED, y=2.0)],
 )
-def test_a_parked_object_that_was_taken_away_leaves_its_place(tiny_scene, state, operation):
+def test_removing_a_parked_object_uncovers_its_place(tiny_scene, state, operation):
     assert at(tiny_scene, state, operation) == (PARKED,)
 
 
-def test_small_moves_and_moves_of_what_was_driving_leave_no_place(tiny_scene, state):
+def test_small_moves_and_moves_of_driving_objects_uncover_nothing(tiny_scene, state):
     driving = next(o.object_id for o in state.visible if not o.standing)
     nudged = Translate(object_id=PARKED, y=0.1)
     assert at(tiny_scene, state, nudged, Delete(object_id=driving)) == ()
@@ -54,11 +54,11 @@ def test_an_impact_that_pushes_a_parked_object_away_uncovers_its_place(tiny_scen
     assert vacated_parking(state, poses | {PARKED: pushed}) == (PARKED,)
 
 
-def test_what_was_not_recorded_at_a_time_has_not_left_its_place(state):
+def test_objects_not_recorded_at_a_time_uncover_nothing(state):
     assert vacated_parking(state, {}) == ()
 
 
-def test_the_ground_there_takes_the_colour_around_it_and_what_stood_up_is_gone(tiny_scene):
+def test_uncovered_ground_takes_the_surrounding_colour(tiny_scene):
     parked = tiny_scene.object(PARKED)
     centre = parked.trajectory.transform(tiny_scene.start_us)[:3, 3]
     half = torch.tensor(parked.size) / 2
@@ -84,7 +84,7 @@ def test_the_ground_there_takes_the_colour_around_it_and_what_stood_up_is_gone(t
     assert torch.equal(clean.opacities[:-1], smeared.opacities[:-1])
 
 
-def test_ground_coloured_by_guess_was_never_seen(tiny_scene):
+def test_inpainted_ground_counts_as_never_seen(tiny_scene):
     known = replace(
         tiny_scene.background, uncertainties=torch.full((len(tiny_scene.background),), 0.02)
     )

@@ -1,4 +1,4 @@
-"""Laws that hold for any sequence of operations."""
+"""Properties that hold for any sequence of operations."""
 
 from __future__ import annotations
 
@@ -157,7 +157,7 @@ def state(state_with_assets: ScenarioState) -> ScenarioState:
 
 
 def possible(state: ScenarioState, operations: list[Operation]) -> list[Operation]:
-    """The operations that apply one after the other; those that would be refused left out."""
+    """The operations that can be applied in order, without those that would be refused."""
     kept: list[Operation] = []
     for operation in operations:
         try:
@@ -183,7 +183,7 @@ def same_bits(a: ScenarioState, b: ScenarioState) -> bool:
 
 
 def assert_close(a: ObjectState, b: ObjectState, tolerance: float = 1e-9) -> None:
-    """Same object within ``tolerance``; a rotation q equals -q."""
+    """The same object within ``tolerance``; rotations q and -q are equal."""
     assert (a.object_id, a.source_id, a.size, a.instance_id, a.deleted, a.asset) == (
         (b.object_id, b.source_id, b.size, b.instance_id, b.deleted, b.asset)
     )
@@ -223,9 +223,7 @@ BATCHES = st.lists(OPERATIONS, min_size=1, max_size=8)
 
 @ENOUGH
 @given(operations=BATCHES)
-def test_inverse_operations_bring_every_object_back(
-    state: ScenarioState, operations: list[Operation]
-):
+def test_inverse_operations_restore_every_object(state: ScenarioState, operations: list[Operation]):
     outcome = apply_operations(state, possible(state, operations))
 
     restored = apply_operations(outcome.state, outcome.inverse).state
@@ -239,7 +237,7 @@ def test_inverse_operations_bring_every_object_back(
 
 @ENOUGH
 @given(batches=st.lists(BATCHES, min_size=1, max_size=5))
-def test_undoing_everything_restores_the_very_first_state(
+def test_undoing_everything_restores_the_initial_state(
     state: ScenarioState, batches: list[list[Operation]]
 ):
     scenario = Scenario(state)
@@ -254,7 +252,7 @@ def test_undoing_everything_restores_the_very_first_state(
 
 @ENOUGH
 @given(batches=st.lists(BATCHES, min_size=1, max_size=4), moves=st.lists(st.booleans(), max_size=8))
-def test_a_replayed_log_gives_the_same_bits(
+def test_replaying_a_log_is_reproducible(
     state: ScenarioState, batches: list[list[Operation]], moves: list[bool]
 ):
     scenario = Scenario(state)
@@ -276,7 +274,7 @@ def test_a_replayed_log_gives_the_same_bits(
 
 @ENOUGH
 @given(batches=st.lists(BATCHES, min_size=1, max_size=4), undos=st.integers(0, 2))
-def test_a_state_kept_on_the_way_gives_the_same_bits_as_the_whole_log(
+def test_replay_from_a_saved_state_equals_replay_of_the_whole_log(
     state: ScenarioState, batches: list[list[Operation]], undos: int
 ):
     scenario = Scenario(state)
@@ -298,7 +296,9 @@ def test_a_state_kept_on_the_way_gives_the_same_bits_as_the_whole_log(
 
 @ENOUGH
 @given(operations=BATCHES)
-def test_undo_then_redo_gives_the_same_bits(state: ScenarioState, operations: list[Operation]):
+def test_undo_then_redo_restores_the_identical_state(
+    state: ScenarioState, operations: list[Operation]
+):
     scenario = Scenario(state)
     edited = scenario.edit(possible(state, operations)).state
 
@@ -310,7 +310,7 @@ def test_undo_then_redo_gives_the_same_bits(state: ScenarioState, operations: li
 
 @ENOUGH
 @given(operations=BATCHES, place=st.integers(0, 8))
-def test_one_refused_operation_refuses_the_batch(
+def test_one_refused_operation_rejects_the_batch(
     state: ScenarioState, operations: list[Operation], place: int
 ):
     scenario = Scenario(state)
@@ -328,9 +328,7 @@ def test_one_refused_operation_refuses_the_batch(
 
 @ENOUGH
 @given(operations=BATCHES)
-def test_objects_nobody_named_are_shared_not_copied(
-    state: ScenarioState, operations: list[Operation]
-):
+def test_untouched_objects_are_shared_not_copied(state: ScenarioState, operations: list[Operation]):
     batch = possible(state, operations)
     after = apply_operations(state, batch).state
 

@@ -43,7 +43,7 @@ def test_an_unknown_asset_is_refused(state):
 
 
 @pytest.mark.parametrize("where", [{}, {"pose": HERE, "trajectory": "both"}])
-def test_an_insert_is_at_exactly_one_place(where):
+def test_an_insert_needs_exactly_one_position(where):
     track = Track(times_us=[0], positions=[(0, 0, 0)], quaternions=[(1, 0, 0, 0)])
     given = {k: track if v == "both" else v for k, v in where.items()}
     with pytest.raises(ValueError, match="either a pose or a trajectory"):
@@ -67,7 +67,7 @@ def test_a_replacement_by_length_keeps_proportions_and_the_bottom(state):
     assert new.trajectory.positions[0, 2] == pytest.approx(0.8)
 
 
-def test_the_inverse_of_a_replacement_brings_the_recorded_look_back(state):
+def test_the_inverse_of_a_replacement_restores_the_recorded_look(state):
     outcome = apply_operations(state, [Replace(object_id="parked", asset_id="van", fit="length")])
     back = apply_operations(outcome.state, outcome.inverse).state.objects["parked"]
 
@@ -82,7 +82,7 @@ def test_regions_and_objects_share_ids(state):
         apply_operations(state, [region])
 
 
-def test_an_erased_region_comes_and_goes_by_its_id(state):
+def test_an_erased_region_is_added_and_removed_by_id(state):
     region = EraseRegion(pose=HERE, size=(1, 1, 1))
     erased = apply_operations(state, [region])
     gone = apply_operations(erased.state, [Delete(object_id="region_1")]).state

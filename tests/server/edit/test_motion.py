@@ -33,7 +33,7 @@ def lane_change(**time_range):
     return Translate(object_id="crossing", y=3.5, time_range=span)
 
 
-def test_a_shift_from_a_time_on_changes_nothing_before_and_all_after(state):
+def test_a_shift_from_a_time_changes_only_what_comes_after(state):
     moved = trajectory(state, lane_change(start_us=SECOND, blend_us=2 * SECOND))
     before = state.objects["crossing"].trajectory
 
@@ -49,14 +49,14 @@ def test_a_shift_up_to_a_time_fades_out_before_it(state):
     np.testing.assert_allclose(offsets[:, 1], [3.5, 3.5, 1.75, 0, 0], atol=1e-9)
 
 
-def test_a_blend_has_no_jerk_where_it_meets_the_recording(state):
+def test_a_blend_joins_the_recording_smoothly(state):
     moved = trajectory(state, lane_change(start_us=SECOND, blend_us=2 * SECOND))
     before = state.objects["crossing"].trajectory
 
     times = np.arange(SECOND, 3 * SECOND + 1, 50_000)
     offset = (sample(moved, times)[0] - sample(before, times)[0])[:, 1, 3]
     speed = np.diff(offset) / 0.05
-    # Minimum jerk over T seconds and D metres peaks at 1.875 D / T.
+    # A minimum-jerk motion of D metres in T seconds peaks at 1.875 D / T.
     assert speed.max() == pytest.approx(1.875 * 3.5 / 2, rel=0.01)
     assert speed[[0, -1]].max() < 0.02 * speed.max()
     assert (speed >= 0).all()
@@ -70,7 +70,7 @@ def test_without_a_blend_the_edit_jumps_within_a_microsecond(state):
     np.testing.assert_allclose(offsets, [0, 3.5], atol=1e-9)
 
 
-def test_a_turn_in_a_time_range_keeps_positions_and_fades_in(state):
+def test_a_rotation_in_a_time_range_keeps_positions_and_fades_in(state):
     span = TimeRange(start_us=2 * SECOND, blend_us=SECOND)
     turned = trajectory(
         state, Rotate(object_id="parked", angle=np.pi / 2, time_range=span), of="parked"
@@ -86,7 +86,7 @@ def test_a_time_range_that_ends_before_it_starts_is_refused():
         TimeRange(start_us=2, end_us=1)
 
 
-def test_retiming_makes_the_same_way_later_and_faster(state):
+def test_retiming_follows_the_same_path_later_and_faster(state):
     retimed = trajectory(state, Retime(object_id="late", delay_us=SECOND, speed=2), of="late")
     before = state.objects["late"].trajectory
 
@@ -111,7 +111,7 @@ def test_retiming_to_the_same_microsecond_is_refused(state):
         Translate(object_id="parked", x=-12, y=-3, z=1.0, snap=True),
     ],
 )
-def test_what_snaps_stands_on_the_ground(state, operation):
+def test_a_snapped_object_stands_on_the_ground(state, operation):
     standing = apply_operations(state, [operation]).state.objects["parked"]
 
     bottoms = box_corners(standing.trajectory.transform(0), standing.scaled_size)[:4, 2]

@@ -1,4 +1,4 @@
-"""The contract of edit operations, for all members of the family and for one that is made here."""
+"""The contract of edit operations, for all built-in ones and one defined here."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ POSE = Pose(position=(3.0, 1.0, 0.8))
 
 
 class Mirror(Model):
-    """Swap left and right of an object's way, seen from the x axis of the world."""
+    """Mirror an object's path at the x axis of the world."""
 
     op: Literal["mirror"] = "mirror"
     object_id: str
@@ -96,7 +96,7 @@ def state(summary, monkeypatch) -> ScenarioState:
 
 
 def described(state: ScenarioState) -> list[Any]:
-    """What an inverse must bring back, without ids that stay reserved."""
+    """What an inverse must restore, without ids that stay reserved."""
     return [
         [
             (o.object_id, o.scale, o.source_id, o.trajectory.times_us.tolist(), o.deleted)
@@ -110,7 +110,7 @@ def described(state: ScenarioState) -> list[Any]:
     ]
 
 
-def test_every_operation_of_the_wire_is_registered():
+def test_every_operation_of_the_protocol_is_registered():
     union, _ = get_args(Operation)
 
     assert set(get_args(union)) == set(APPLY)
@@ -121,7 +121,7 @@ def test_there_is_an_example_of_every_operation(state):
 
 
 @pytest.mark.parametrize("index", range(16))
-def test_an_operation_makes_a_new_state_and_leaves_the_old_one(state, index):
+def test_an_operation_makes_a_new_state_and_leaves_the_old_one_unchanged(state, index):
     before = described(state)
     after = apply_operations(state, [examples(state)[index]]).state
 
@@ -130,7 +130,7 @@ def test_an_operation_makes_a_new_state_and_leaves_the_old_one(state, index):
 
 
 @pytest.mark.parametrize("index", range(16))
-def test_the_inverse_takes_an_operation_back(state, index):
+def test_the_inverse_undoes_an_operation(state, index):
     outcome = apply_operations(state, [examples(state)[index]])
     back = apply_operations(outcome.state, outcome.inverse).state
 
@@ -141,7 +141,7 @@ def test_the_inverse_takes_an_operation_back(state, index):
 
 
 @pytest.mark.parametrize("index", range(15))
-def test_an_operation_on_an_unknown_object_is_refused_by_its_place(state, index):
+def test_an_operation_on_an_unknown_object_is_refused_with_its_location(state, index):
     example = examples(state)[index]
     if not hasattr(example, "object_id"):
         pytest.skip("names no object")

@@ -1,4 +1,4 @@
-"""Point clouds of scenarios: where Gaussians are, of what, and which way they look."""
+"""Point clouds of scenarios: positions, objects and normals of Gaussians."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from real2sim_server.scene.io import save_scene
 from real2sim_server.scene.io.ply import read_ply_elements
 
 
-def test_points_are_of_background_and_objects_at_an_instant(tiny_scene):
+def test_points_cover_background_and_objects_at_an_instant(tiny_scene):
     state = ScenarioState.of(tiny_scene)
     rows = points_at(tiny_scene, state, 0)
     parts = [points_at(tiny_scene, state, 0, part=part) for part in ("background", "objects")]
@@ -30,7 +30,7 @@ def test_points_are_of_background_and_objects_at_an_instant(tiny_scene):
             assert set(own["semantic"]) == {SEMANTIC_CLASSES["car"]}
 
 
-def test_normals_are_unit_and_those_of_the_ground_point_up(tiny_scene):
+def test_normals_are_unit_vectors_and_ground_normals_point_up(tiny_scene):
     rows = points_at(tiny_scene, ScenarioState.of(tiny_scene), 0, part="background")
     normals = np.stack([rows[f"n{axis}"] for axis in "xyz"], axis=1)
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-5)
@@ -48,7 +48,7 @@ def test_points_of_a_moved_object_have_moved(tiny_scene):
     np.testing.assert_allclose(after["x"] - before["x"], 2.0, atol=1e-4)
 
 
-def test_the_command_writes_one_file_or_one_for_each(tiny_scene, tmp_path):
+def test_the_command_writes_one_file_or_one_per_object(tiny_scene, tmp_path):
     save_scene(tiny_scene, tmp_path / "tiny.r2s")
     whole, apart = tmp_path / "all.ply", tmp_path / "apart"
     for out in (whole, apart):
@@ -61,6 +61,6 @@ def test_the_command_writes_one_file_or_one_for_each(tiny_scene, tmp_path):
     assert sum(counts) == len(found)
 
 
-def test_a_file_of_no_points_has_a_header(tmp_path):
+def test_a_file_without_points_has_a_header(tmp_path):
     (tmp_path / "none.ply").write_bytes(b"".join(ply_of_points(np.zeros(0, ROW))))
     assert len(read_ply_elements(tmp_path / "none.ply")["vertex"]) == 0

@@ -13,7 +13,7 @@ from real2sim_proto.operations import (
 from real2sim_server.edit import EditError, apply_operations
 
 
-def test_physics_left_out_goes_back_to_its_default(state):
+def test_omitted_physics_values_return_to_their_defaults(state):
     heavy = SetPhysics(object_id="parked", mass=2000, friction=0.4)
     slippery = SetPhysics(object_id="parked", friction=0.1)
     after = apply_operations(state, [heavy, slippery]).state.objects["parked"]
@@ -21,7 +21,7 @@ def test_physics_left_out_goes_back_to_its_default(state):
     assert (after.physics.mass, after.physics.friction) == (None, 0.1)
 
 
-def test_the_inverse_of_physics_names_what_was_set_before(state):
+def test_the_inverse_of_set_physics_restores_the_previous_values(state):
     heavy = SetPhysics(object_id="parked", mass=2000)
     outcome = apply_operations(state, [heavy, SetPhysics(object_id="parked", mass=10)])
 
@@ -37,7 +37,7 @@ def test_a_copy_inherits_physics_and_velocity(state):
     assert (twin.velocity.linear, twin.physics.mass) == ((9, 0, 0), 2000)
 
 
-def test_the_inverse_of_a_copys_physics_names_the_copy(state):
+def test_the_inverse_of_a_copys_physics_refers_to_the_copy(state):
     heavy = SetPhysics(object_id="parked", mass=2000)
     copied = apply_operations(state, [heavy, Duplicate(object_id="parked", new_id="twin")]).state
     outcome = apply_operations(copied, [SetPhysics(object_id="twin")])

@@ -12,7 +12,7 @@ from real2sim_server.edit.scenario import KEPT_STATES
 SHIFT = [Translate(object_id="parked", x=1)]
 
 
-def test_every_entry_grows_the_revision_by_one(state):
+def test_every_entry_increases_the_revision_by_one(state):
     scenario = Scenario(state, scene="street", scene_hash="abc")
     scenario.edit(SHIFT)
     scenario.undo()
@@ -26,7 +26,7 @@ def test_every_entry_grows_the_revision_by_one(state):
     assert scenario.revision == 3
 
 
-def test_undo_returns_the_very_state_before(state):
+def test_undo_returns_the_previous_state_object(state):
     scenario = Scenario(state)
     scenario.edit(SHIFT)
 
@@ -35,7 +35,7 @@ def test_undo_returns_the_very_state_before(state):
     assert scenario.can_redo
 
 
-def test_a_new_edit_after_an_undo_ends_redo(state):
+def test_a_new_edit_after_an_undo_clears_redo(state):
     scenario = Scenario(state)
     scenario.edit(SHIFT)
     scenario.undo()
@@ -54,7 +54,7 @@ def test_undo_without_an_edit_is_refused(state):
     assert refused.value.code == ErrorCode.NOTHING_TO_UNDO
 
 
-def test_a_dry_run_answers_and_changes_nothing(state):
+def test_a_dry_run_responds_and_changes_nothing(state):
     scenario = Scenario(state)
     outcome = scenario.edit([Duplicate(object_id="parked")], dry_run=True)
 
@@ -73,7 +73,7 @@ def test_planning_alone_changes_nothing(state):
     assert scenario.entries == [planned.entry]
 
 
-def test_a_plan_overtaken_by_another_commit_is_refused(state):
+def test_a_plan_made_stale_by_another_commit_is_refused(state):
     scenario = Scenario(state)
     first, second = scenario.plan_edit(SHIFT), scenario.plan_edit(SHIFT)
     scenario.commit(first)

@@ -11,7 +11,7 @@ from real2sim_server.edit.tracks import sample
 
 @settings(deadline=None)
 @given(t_us=st.integers(-200_000, 5_200_000))
-def test_a_common_look_up_agrees_with_each_trajectory(state, t_us):
+def test_a_joint_lookup_agrees_with_each_trajectory(state, t_us):
     placed = state.tracks.at(t_us)
 
     covering = [o for o in state.visible if o.trajectory.covers(t_us)]
@@ -27,7 +27,7 @@ def test_a_common_look_up_agrees_with_each_trajectory(state, t_us):
 
 
 @pytest.mark.parametrize("t_us", [0, 2_000_000, 3_900_000, 4_900_000])
-def test_at_time_stamps_the_pose_is_the_recorded_one_to_the_bit(state, t_us):
+def test_poses_at_timestamps_are_exactly_the_recorded_ones(state, t_us):
     placed = state.tracks.at(t_us)
 
     for k, subject in enumerate(placed.objects):
@@ -36,14 +36,14 @@ def test_at_time_stamps_the_pose_is_the_recorded_one_to_the_bit(state, t_us):
         assert placed.quaternions[k].tobytes() == quaternion.tobytes()
 
 
-def test_no_objects_are_nowhere():
+def test_no_objects_give_no_poses():
     placed = PackedTracks(()).at(0)
 
     assert placed.objects == ()
     assert placed.transforms.shape == (0, 4, 4)
 
 
-def test_sampling_agrees_with_single_look_ups(state):
+def test_sampling_agrees_with_single_lookups(state):
     trajectory = state.objects["late"].trajectory
     times = np.arange(0, 5_000_000, 70_000)
     transforms, covered = sample(trajectory, times)

@@ -17,7 +17,7 @@ def warnings(state, *operations):
     return [(w.code, w.object_id) for w in outcome.warnings]
 
 
-def test_a_harmless_shift_warns_of_nothing(state):
+def test_a_harmless_shift_gives_no_warning(state):
     assert warnings(state, Translate(object_id="parked", x=1)) == []
 
 
@@ -36,7 +36,7 @@ def test_a_copy_in_a_deleted_original_does_not_overlap(state):
 
 
 def test_paths_that_cross_at_different_times_do_not_overlap(state):
-    # "crossing" passes (7.6, -27.6) after one second and is 24 m further at t = 4 s.
+    # "crossing" passes (7.6, -27.6) after one second and is 24 m farther on at t = 4 s.
     there = SetPose(object_id="parked", pose=Pose(position=(7.6, -27.6, 0.8)))
     assert warnings(state, there) == [("overlap", "parked")]
 
@@ -66,7 +66,7 @@ def test_an_object_off_the_ground_is_reported_with_its_height(state, lift, side)
         Rotate(object_id="parked", angle=1),
     ],
 )
-def test_what_stays_on_the_ground_is_not_reported(state, operation):
+def test_an_object_on_the_ground_is_not_reported(state, operation):
     assert warnings(state, operation) == []
 
 
@@ -76,7 +76,7 @@ def test_a_tilted_object_digs_into_the_ground(state):
     assert warnings(state, tilt) == [("off_ground", "parked")]
 
 
-def test_the_ground_is_asked_where_it_is_known(state):
+def test_the_known_ground_height_is_used(state):
     rise = np.repeat(0.1 * np.arange(80.0)[:, None], 80, axis=1)
     slope = Ground(np.array([-0.5, -40.5]), 1.0, rise, np.ones((80, 80), dtype=bool))
     up_the_hill = Translate(object_id="parked", x=10, z=1)
@@ -98,8 +98,8 @@ def test_objects_far_from_everything_recorded_are_reported(state, y, expected):
     assert warnings(state, Translate(object_id="parked", y=y)) == expected
 
 
-def test_in_a_large_scenario_no_trajectory_is_sampled_again_for_each_edit(state, monkeypatch):
-    """With 600 overlapping copies; the cost of a batch grows with them and does not leap."""
+def test_edits_of_a_large_scenario_do_not_resample_trajectories(state, monkeypatch):
+    """With 600 overlapping copies, the cost of a batch grows steadily, without a jump."""
     copies = [Duplicate(object_id="parked", new_id=f"copy_{k}", x=0.01) for k in range(600)]
     crowded = apply_operations(state, copies).state
     sampled = []

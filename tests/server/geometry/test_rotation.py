@@ -80,7 +80,7 @@ def test_slerp_takes_the_shortest_arc_at_constant_speed(a, b, fraction):
 
 
 @given(quaternions, quaternions, st.floats(0, 1))
-def test_slerp_does_not_care_for_the_sign_of_a_quaternion(a, b, fraction):
+def test_slerp_does_not_depend_on_quaternion_sign(a, b, fraction):
     if abs(np.dot(a, b)) > 1e-6:
         assert same_rotation(slerp(a, b, fraction), slerp(a, -b, fraction))
 
@@ -116,5 +116,5 @@ def test_batches_are_treated_one_by_one():
         np.zeros((3, 3)),
     ],
 )
-def test_what_is_no_rotation_is_told_apart(matrix):
+def test_non_rotations_are_recognised(matrix):
     assert not is_rotation(matrix)

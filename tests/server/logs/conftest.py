@@ -1,4 +1,4 @@
-"""Small drives in every layout that the readers know."""
+"""Small drives in every supported layout."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def written_waymo_v2(tiny_log: SyntheticLog, tmp_path_factory: pytest.TempPathFa
 
 
 def _layout(name: str) -> ModuleType:
-    """A module of ``layouts``; test folders are not packages."""
+    """Import a module of ``layouts``, since test folders are not packages."""
     path = Path(__file__).parent / "layouts" / f"{name}.py"
     spec = importlib.util.spec_from_file_location(f"log_layouts_{name}", path)
     assert spec is not None
@@ -128,7 +128,7 @@ def kitti_folder(written_kitti: Path, tmp_path: Path) -> Path:
 
 
 def _write_kitti_layout(log: DrivingLog, root: Path, *, sequence: str) -> None:
-    """KITTI tracking layout; rectified cam0 is the log's first camera."""
+    """Write the KITTI tracking layout. Rectified cam0 is the log's first camera."""
     cam0 = log.rig["front"].T_vehicle_camera
     names = {"image_00": "front", "image_02": "front_left"}
     scanner = log.lidar(0).origin.astype(np.float64)
@@ -161,7 +161,7 @@ def _write_calibration(
     rows = []
     for name, camera in names.items():
         lens = log.rig[camera]
-        # Rectified cameras look the same way: all are written as shifts of cam0.
+        # Rectified cameras have the same orientation, so all are shifts of cam0.
         shift = invert_transform(lens.T_vehicle_camera)[:3, :3] @ (
             cam0[:3, 3] - lens.T_vehicle_camera[:3, 3]
         )
@@ -181,7 +181,7 @@ def _write_calibration(
 
 
 def _raw_scan(log: DrivingLog, frame: int, scanner: np.ndarray) -> np.ndarray:
-    """The sweep as a scanner records it: every point seen from where the vehicle was then."""
+    """The uncompensated sweep: each point relative to the sensor pose at its own time."""
     sweep, times = log.lidar(frame), log.frame_times_us
     t_us = int(times[frame])
     here = log.ego.transform(t_us)
@@ -195,7 +195,7 @@ def _raw_scan(log: DrivingLog, frame: int, scanner: np.ndarray) -> np.ndarray:
 
 
 def _moved_ego(log: DrivingLog, frame: int, offset_us: int) -> np.ndarray:
-    """Pose at a time that may lie outside the log: there straight on."""
+    """Ego pose, extrapolated at constant velocity outside the log."""
     t_us = int(log.frame_times_us[frame]) + offset_us
     edge = min(max(t_us, log.ego.start_us), log.ego.end_us)
     pose = log.ego.transform(edge)

@@ -1,7 +1,7 @@
-"""What every log reader promises; a class of tests that each of them passes.
+"""The contract of log readers, as a class of tests.
 
-A reader's test class derives from :class:`ReaderContract` and has a fixture ``folder`` that holds a
-drive in the reader's layout, at least two frames long, with a LiDAR on the roof and boxes.
+Derive a test class from :class:`ReaderContract` and define a fixture ``folder``: a drive in the
+reader's layout with at least two frames, a roof LiDAR and boxes.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from real2sim_server.logs.readers import READERS
 
 
 class ReaderContract:
-    """Tests of a reader by a folder in its layout."""
+    """Tests of a reader with a folder in its layout."""
 
     @pytest.fixture
     def log(self, folder: Path) -> DrivingLog:
@@ -40,7 +40,7 @@ class ReaderContract:
             assert image.shape == (camera.height, camera.width, 3)
             assert image.dtype == np.uint8
 
-    def test_sweeps_are_whole(self, log: DrivingLog) -> None:
+    def test_sweeps_are_complete(self, log: DrivingLog) -> None:
         sweep = log.lidar(log.frame_count - 1)
         n = len(sweep.points)
         assert n > 1000
@@ -51,11 +51,11 @@ class ReaderContract:
         assert np.isfinite(sweep.points).all()
         assert sweep.intensity.min() >= 0
         assert sweep.intensity.max() <= 1
-        # Within one turn; where it starts relative to the time stamp is up to the data set.
+        # Within one revolution. Its start relative to the timestamp depends on the data set.
         assert np.abs(sweep.offset_us).max() <= 110_000
         assert np.ptp(sweep.offset_us) <= 110_000
 
-    def test_sensor_is_above_the_ground_and_the_ground_at_zero(self, log: DrivingLog) -> None:
+    def test_sensor_is_above_the_ground_and_the_ground_is_at_zero(self, log: DrivingLog) -> None:
         sweep = log.lidar(0)
         assert 1.5 < sweep.origin[2] < 2.3
         x, y, z = sweep.points.T
@@ -75,7 +75,7 @@ class ReaderContract:
     def test_provenance_is_plain_json(self, log: DrivingLog) -> None:
         assert json.loads(json.dumps(dict(log.provenance)))["reader"]
 
-    def test_opening_twice_gives_the_same_bits(self, folder: Path) -> None:
+    def test_opening_is_reproducible(self, folder: Path) -> None:
         one, two = open_log(folder), open_log(folder)
         camera = one.rig.names[0]
         assert (one.image(camera, 1) == two.image(camera, 1)).all()

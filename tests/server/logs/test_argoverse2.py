@@ -33,7 +33,7 @@ def folder(written_argoverse2: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(written_argoverse2, tmp_path / "log"))
 
 
-def test_drive_is_put_on_the_ground(log: DrivingLog, tiny_log: SyntheticLog) -> None:
+def test_poses_are_shifted_to_the_ground(log: DrivingLog, tiny_log: SyntheticLog) -> None:
     np.testing.assert_allclose(log.ego.positions, tiny_log.ego.positions, atol=1e-9)
     for name, given in (("ring_front_center", "front"), ("ring_front_left", "front_left")):
         np.testing.assert_allclose(log.rig[name].K, tiny_log.rig[given].K, atol=1e-9)
@@ -42,7 +42,7 @@ def test_drive_is_put_on_the_ground(log: DrivingLog, tiny_log: SyntheticLog) -> 
         )
 
 
-def test_boxes_are_placed(log: DrivingLog, tiny_log: SyntheticLog) -> None:
+def test_boxes_have_their_poses(log: DrivingLog, tiny_log: SyntheticLog) -> None:
     names = log.provenance["track_ids"]
     read = {names[t.object_id]: t for t in log.tracks}
     shift = int(log.frame_times_us[0])
@@ -56,13 +56,13 @@ def test_boxes_are_placed(log: DrivingLog, tiny_log: SyntheticLog) -> None:
             )
 
 
-def test_points_come_back_to_half_floats(log: DrivingLog, tiny_log: SyntheticLog) -> None:
+def test_points_round_trip_within_half_precision(log: DrivingLog, tiny_log: SyntheticLog) -> None:
     read, given = log.lidar(1), tiny_log.lidar(1)
     np.testing.assert_allclose(read.points, given.points, rtol=6e-4, atol=6e-4)
     assert (read.offset_us == given.offset_us + 50_000).all()
 
 
-def test_camera_without_images_is_left_out_and_named(log: DrivingLog) -> None:
+def test_camera_without_images_is_omitted_and_named(log: DrivingLog) -> None:
     assert log.provenance["cameras_without_images"] == ["ring_rear_left"]
     assert log.rig.names == ("ring_front_center", "ring_front_left")
 
@@ -75,7 +75,7 @@ def test_frames_at_the_ends_that_lack_an_image_are_dropped(folder: Path) -> None
     np.testing.assert_allclose(log.ego.transform(int(log.frame_times_us[0])), np.eye(4), atol=1e-9)
 
 
-def test_nearest_image_is_taken_and_its_time_kept(folder: Path) -> None:
+def test_nearest_image_is_used_with_its_time(folder: Path) -> None:
     path = _images(folder)[1]
     path.rename(path.with_stem(str(int(path.stem) + 17_000_000)))
     log = open_log(folder)
@@ -84,7 +84,7 @@ def test_nearest_image_is_taken_and_its_time_kept(folder: Path) -> None:
 
 
 def test_sample_has_its_points_in_every_box(sample: DrivingLog, test_data: Path) -> None:
-    """The data set counted them itself (``num_interior_pts``)."""
+    """Point counts match ``num_interior_pts`` of the data set."""
     path = next((test_data / "argoverse2").glob("*/annotations.feather"))
     rows = feather.read_table(path).to_pylist()
     names = {key: object_id for object_id, key in sample.provenance["track_ids"].items()}
@@ -176,7 +176,7 @@ BAD_LOGS: dict[str, tuple[Callable[[Path], None], str]] = {
 
 
 @pytest.mark.parametrize("case", BAD_LOGS)
-def test_bad_log_is_refused_with_its_place(folder: Path, case: str) -> None:
+def test_bad_log_is_refused_with_its_location(folder: Path, case: str) -> None:
     change, message = BAD_LOGS[case]
     change(folder)
     with pytest.raises(LogError, match=message):

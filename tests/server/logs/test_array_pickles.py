@@ -1,4 +1,4 @@
-"""Pickled arrays of unknown origin: what they hold is read, what they ask for is not done."""
+"""Untrusted pickled arrays: arrays are read, and no code is run."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from real2sim_server.logs.readers.street_gaussians import read_pickled_arrays
 
 
 def written(path: Path, pickled: bytes) -> Path:
-    """An ``.npz`` whose entry ``clouds`` is one object made of ``pickled``."""
+    """Write an ``.npz`` whose entry ``clouds`` is the object ``pickled``."""
     head = io.BytesIO()
     described = {"descr": "|O", "fortran_order": False, "shape": ()}
     np.lib.format.write_array_header_1_0(head, described)
@@ -26,7 +26,7 @@ def written(path: Path, pickled: bytes) -> Path:
 
 
 class Calling:
-    """Pickles to a call."""
+    """An object that pickles to a call."""
 
     def __init__(self, function, *arguments, state=None):
         self.made_by = (function, arguments, state) if state else (function, arguments)
@@ -36,7 +36,7 @@ class Calling:
 
 
 def pointer_array() -> Calling:
-    """An array of objects over bytes of the file, as pointers."""
+    """An object array whose pointers come from the file."""
     return Calling(np.ndarray, (), np.dtype("O"), b"\x41" * 8)
 
 
@@ -55,7 +55,7 @@ def test_a_dictionary_of_arrays_is_read(tmp_path, protocol):
         np.testing.assert_array_equal(back[key], array)
 
 
-def test_what_savez_writes_is_read(tmp_path):
+def test_arrays_written_by_savez_are_read(tmp_path):
     np.savez(tmp_path / "a.npz", clouds={7: np.ones((2, 3))})
     assert read_pickled_arrays(tmp_path / "a.npz", "clouds")[7].tolist() == [[1, 1, 1]] * 2
 
@@ -85,27 +85,27 @@ def test_anything_but_arrays_of_numbers_is_refused(tmp_path, value):
         read_pickled_arrays(file, "clouds")
 
 
-def test_a_pointer_of_the_file_is_never_followed_even_without_a_process_of_its_own(tmp_path):
+def test_pointers_in_the_file_are_refused_in_process(tmp_path):
     file = written(tmp_path / "a.npz", pickle.dumps({0: pointer_array()}, protocol=4))
     with pytest.raises(LogError):
         street_gaussians.unpack_arrays(str(file), "clouds", str(tmp_path))
 
 
-def test_bytes_that_do_not_fit_the_shape_are_refused(tmp_path):
+def test_truncated_pickles_are_refused(tmp_path):
     whole = pickle.dumps({0: np.arange(10, dtype=np.float32)}, protocol=4)
     for end in range(0, len(whole), 7):
         with pytest.raises(LogError, match="entry 'clouds'"):
             read_pickled_arrays(written(tmp_path / "a.npz", whole[:end]), "clouds")
 
 
-def test_an_entry_that_unpacks_to_more_than_is_allowed_is_refused(tmp_path, monkeypatch):
+def test_an_entry_beyond_the_size_limit_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(street_gaussians, "MAX_ENTRY_BYTES", 1000)
     np.savez_compressed(tmp_path / "a.npz", clouds={0: np.zeros(1000)})
     with pytest.raises(LogError, match="allowed are 1000"):
         street_gaussians.unpack_arrays(str(tmp_path / "a.npz"), "clouds", str(tmp_path))
 
 
-def test_a_memo_that_asks_for_all_memory_is_an_error(tmp_path):
+def test_a_pickle_that_exhausts_memory_is_refused(tmp_path):
     greedy = b"\x80\x04" + b"N" + b"r\xff\xff\xff\x7f" + b"."
     with pytest.raises(LogError, match="memory"):
         read_pickled_arrays(written(tmp_path / "a.npz", greedy), "clouds")

@@ -50,21 +50,21 @@ def test_good_logs_pass(layout: str, decode: bool, request: pytest.FixtureReques
 
 
 @pytest.mark.parametrize("name", ["000000.png", "000001.png"])
-def test_cut_image_is_named(kitti_folder: Path, name: str) -> None:
+def test_truncated_image_is_named(kitti_folder: Path, name: str) -> None:
     path = kitti_folder / "training/image_02/0007" / name
     path.write_bytes(path.read_bytes()[:-20])
     with pytest.raises(LogError, match=f"image_02/0007/{name}: the image is cut off"):
         check_log(open_log(kitti_folder)).raise_for_problems()
 
 
-def test_cut_jpeg_is_named(drivestudio: Path) -> None:
+def test_truncated_jpeg_is_named(drivestudio: Path) -> None:
     path = drivestudio / "images/001_0.jpg"
     path.write_bytes(path.read_bytes()[:-300])
     with pytest.raises(LogError, match=r"images/001_0\.jpg: the image is cut off"):
         check_log(open_log(drivestudio)).raise_for_problems()
 
 
-def test_damage_inside_a_jpeg_is_found_by_decoding(drivestudio: Path) -> None:
+def test_damage_inside_a_jpeg_is_found_only_by_decoding(drivestudio: Path) -> None:
     path = drivestudio / "images/001_0.jpg"
     data = bytearray(path.read_bytes())
     middle = len(data) // 2
@@ -76,7 +76,7 @@ def test_damage_inside_a_jpeg_is_found_by_decoding(drivestudio: Path) -> None:
     assert "images/001_0.jpg: is a damaged JPEG" in problem
 
 
-def test_jpegs_decode_as_opencv_decodes_them(tiny_log: SyntheticLog) -> None:
+def test_jpeg_decoding_matches_opencv(tiny_log: SyntheticLog) -> None:
     data = encode_image(tiny_log.image("front", 0), ".jpg")
     from real2sim_server.logs.images import decode_image
 
@@ -90,7 +90,7 @@ def told(folder: Path, *options: str) -> Result:
 
 @pytest.fixture(scope="session")
 def written_long(tiny_log: SyntheticLog, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Eight frames of the same street; frames 0, 4 and 7 are those that a report reads."""
+    """Eight frames of the same street. A report reads frames 0, 4 and 7."""
     times = np.arange(8) * 100_000
     still = Trajectory(times[[0, 7]], np.zeros((2, 3)), np.tile([1.0, 0, 0, 0], (2, 1)))
     frames = log_of_frames(tiny_log, [0, 1, 2, 0, 1, 2, 0, 1])
@@ -168,7 +168,9 @@ def test_a_sweep_with_a_bad_header_is_found(long_folder: Path, damage: str) -> N
 
 
 @pytest.mark.parametrize("damage", CONTENTS)
-def test_a_sweep_with_bad_contents_is_found_by_reading_all(long_folder: Path, damage: str) -> None:
+def test_a_sweep_with_bad_contents_is_found_only_by_reading_all(
+    long_folder: Path, damage: str
+) -> None:
     how, message = CONTENTS[damage]
     how(long_folder / "lidar/000002.npz")
     done = told(long_folder, "--check")
@@ -180,7 +182,7 @@ def test_a_sweep_with_bad_contents_is_found_by_reading_all(long_folder: Path, da
 
 
 def test_all_bad_files_are_reported_together(long_folder: Path, tmp_path: Path) -> None:
-    """Those that the report itself reads among them; the rest of the report is there."""
+    """Bad files do not suppress the rest of the report, even in frames that it reads."""
     for frame, (damage, _) in zip((0, 1, 4, 5, 6), HEADERS.values(), strict=True):
         damage(long_folder / f"lidar/{frame:06d}.npz")
     not_a_number("points")(long_folder / "lidar/000002.npz")
@@ -205,7 +207,7 @@ def test_all_bad_files_are_reported_together(long_folder: Path, tmp_path: Path) 
     assert (pictures / "frame_000007.jpg").is_file()
 
 
-def test_a_good_log_is_said_to_be_checked_as_far_as_it_was(long_folder: Path) -> None:
+def test_the_report_states_how_much_was_checked(long_folder: Path) -> None:
     done = told(long_folder, "--check")
     assert done.exit_code == 0
     checked = "headers of 24 images and 8 sweeps checked, contents of 3 sweeps read; --all reads"
@@ -216,7 +218,7 @@ def test_a_good_log_is_said_to_be_checked_as_far_as_it_was(long_folder: Path) ->
     assert "contents of 24 images and 8 sweeps read\n" in done.output
 
 
-def test_sweeps_without_points_are_asked_about(native_folder: Path) -> None:
+def test_sweeps_without_points_are_reported(native_folder: Path) -> None:
     empty = native_folder / "lidar/000001.npz"
     with np.load(empty) as parts:
         np.savez(empty, **{k: v[:0] if k != "origin" else v for k, v in parts.items()})
@@ -232,9 +234,7 @@ def test_files_of_selected_frames_are_checked_by_their_headers(native_folder: Pa
     assert len(check.image_problems) == len(check.sweep_problems) == 1
 
 
-def test_log_without_images_says_which_cameras_lack_them(
-    written_argoverse2: Path, tmp_path: Path
-) -> None:
+def test_cameras_without_images_are_named(written_argoverse2: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(written_argoverse2, tmp_path / "log"))
     shutil.rmtree(folder / "sensors/cameras")
     log = open_log(folder)

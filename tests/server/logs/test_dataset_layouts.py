@@ -1,4 +1,4 @@
-"""What the layouts keep of a drive; the smaller readers' own traits and refusals."""
+"""Round trips through dataset layouts, and details of the smaller readers."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ CAMERAS = {
     "drivestudio": {"front": "front", "front_left": "front_left"},
 }
 EGO_TOLERANCE = {"kitti_raw": 2e-4}
-"""Latitudes are written to twelve digits, and the Mercator projection stretches a little."""
+"""Position tolerance [m]. Latitudes have twelve digits, and the Mercator projection distorts."""
 
 
 @pytest.fixture(params=CAMERAS)
@@ -35,14 +35,14 @@ def log(layout: str, request: pytest.FixtureRequest) -> DrivingLog:
     return open_log(request.getfixturevalue(f"written_{layout}"))
 
 
-def test_path_of_the_ego_survives(log: DrivingLog, layout: str, tiny_log: SyntheticLog) -> None:
+def test_ego_trajectory_is_preserved(log: DrivingLog, layout: str, tiny_log: SyntheticLog) -> None:
     assert (np.diff(log.frame_times_us) == np.diff(tiny_log.frame_times_us)).all()
     read = [log.ego.transform(int(t)) for t in log.frame_times_us]
     given = [tiny_log.ego.transform(int(t)) for t in tiny_log.frame_times_us]
     np.testing.assert_allclose(read, given, atol=EGO_TOLERANCE.get(layout, 1e-9))
 
 
-def test_cameras_survive(log: DrivingLog, layout: str, tiny_log: SyntheticLog) -> None:
+def test_cameras_are_preserved(log: DrivingLog, layout: str, tiny_log: SyntheticLog) -> None:
     for name, given in CAMERAS[layout].items():
         np.testing.assert_allclose(log.rig[name].K, tiny_log.rig[given].K, atol=1e-9)
         np.testing.assert_allclose(
@@ -50,7 +50,7 @@ def test_cameras_survive(log: DrivingLog, layout: str, tiny_log: SyntheticLog) -
         )
 
 
-def test_boxes_survive(log: DrivingLog, layout: str, tiny_log: SyntheticLog) -> None:
+def test_boxes_are_preserved(log: DrivingLog, layout: str, tiny_log: SyntheticLog) -> None:
     shift = int(log.frame_times_us[0])
     assert len(log.tracks) == len(tiny_log.tracks)
     for given in tiny_log.tracks:
@@ -72,19 +72,19 @@ def _nearest(log: DrivingLog, given: ObjectTrack, shift: int) -> ObjectTrack:
     )
 
 
-def test_points_survive(log: DrivingLog, layout: str, tiny_log: SyntheticLog) -> None:
+def test_points_are_preserved(log: DrivingLog, layout: str, tiny_log: SyntheticLog) -> None:
     read, given = log.lidar(1), tiny_log.lidar(1)
     tolerance = 2e-3 if layout == "kitti_raw" else 1e-4
     np.testing.assert_allclose(read.points, given.points, atol=tolerance)
 
 
-def test_late_sweeps_say_so(written_nuscenes: Path) -> None:
+def test_late_sweeps_have_an_offset(written_nuscenes: Path) -> None:
     log = open_log(written_nuscenes)
-    # 12 ms late, and the middle of a turn of 50 ms is meant.
+    # 12 ms late, minus half a revolution of 50 ms.
     assert (log.lidar(0).offset_us == 12_000 - 25_000).all()
 
 
-def test_cars_keep_their_class(written_nuscenes: Path, tiny_log: SyntheticLog) -> None:
+def test_vehicles_keep_their_class(written_nuscenes: Path, tiny_log: SyntheticLog) -> None:
     read, given = open_log(written_nuscenes).tracks, tiny_log.tracks
     for category in ("truck", "bus"):
         assert sum(t.category == category for t in read) == sum(
@@ -103,7 +103,7 @@ def test_image_times_of_a_scene_are_kept(copied: Callable[[str], Path]) -> None:
     assert log.image_time_us("cam_front_left", 1) == log.frame_times_us[1] + 9000
 
 
-def test_pickles_with_anything_but_arrays_are_refused_unrun(
+def test_pickles_with_code_are_refused_without_running_it(
     copied: Callable[[str], Path], tmp_path: Path
 ) -> None:
     folder, proof = copied("street_gaussians"), tmp_path / "proof"
@@ -115,7 +115,7 @@ def test_pickles_with_anything_but_arrays_are_refused_unrun(
 
 
 class _Evil:
-    """A pickle of it writes a file when it is loaded the usual way."""
+    """An object whose pickle writes a file when loaded with ``pickle``."""
 
     def __init__(self, proof: Path) -> None:
         self._proof = proof
@@ -124,7 +124,7 @@ class _Evil:
         return Path.touch, (self._proof,)  # type: ignore[return-value]
 
 
-def test_that_pickle_would_have_run(tmp_path: Path) -> None:
+def test_the_malicious_pickle_runs_with_pickle(tmp_path: Path) -> None:
     pickle.loads(pickle.dumps(_Evil(tmp_path / "proof")))
     assert (tmp_path / "proof").exists()
 
@@ -295,7 +295,7 @@ BAD_FOLDERS: dict[str, tuple[str, Callable[[Path], None], str]] = {
 
 
 @pytest.mark.parametrize("case", BAD_FOLDERS)
-def test_bad_folder_is_refused_with_its_place(copied: Callable[[str], Path], case: str) -> None:
+def test_bad_folder_is_refused_with_its_location(copied: Callable[[str], Path], case: str) -> None:
     layout, change, message = BAD_FOLDERS[case]
     folder = copied(layout)
     change(folder)

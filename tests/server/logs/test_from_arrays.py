@@ -1,4 +1,4 @@
-"""The example "From arrays to a log" of ``docs/log_format.md``, as it stands there."""
+"""The example "From arrays to a log" of ``docs/log_format.md``."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ COARSE = InitialiseOptions(
 
 @pytest.fixture(scope="module")
 def example(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
-    """The folder of the log, and the names of the example."""
+    """The folder of the log, and the variables of the example."""
     section = PAGE.read_text(encoding="utf-8").split("## From arrays to a log")[1].split("\n## ")[0]
     names: dict[str, Any] = {}
     with pytest.MonkeyPatch.context() as patch:
@@ -39,17 +39,17 @@ def log(example: tuple[Path, dict[str, Any]]) -> DrivingLog:
     return open_log(example[0])
 
 
-def test_the_log_has_no_problems_and_raises_no_question(example: tuple[Path, Any]) -> None:
+def test_the_log_has_no_problems_and_no_questions(example: tuple[Path, Any]) -> None:
     told = CliRunner().invoke(build_app(), ["log-info", str(example[0]), "--check", "--all"])
     assert told.exit_code == 0
     assert "contents of 5 images and 5 sweeps read\nno problems found" in told.output
     assert "question" not in told.output
 
 
-def test_a_point_measured_on_the_move_is_where_the_wall_was(
+def test_points_measured_while_moving_lie_on_the_wall(
     example: tuple[Path, dict[str, Any]], log: DrivingLog
 ) -> None:
-    """The wall is 8 m to the left of the street; its points span the turn of the LiDAR."""
+    """The wall is 8 m left of the street, and its points span a LiDAR revolution."""
     _, names = example
     T_street_map = invert_transform(names["T_map_street"])
     at = names["point_us"][3]
@@ -62,7 +62,7 @@ def test_a_point_measured_on_the_move_is_where_the_wall_was(
     np.testing.assert_allclose(world[:3000, 1], 8.0, atol=1e-3)
 
 
-def test_the_reconstruction_has_wall_and_car_where_the_arrays_had_them(log: DrivingLog) -> None:
+def test_the_reconstruction_has_the_wall_and_the_car(log: DrivingLog) -> None:
     scene = initialise_scene(log, options=COARSE)
     background = scene.background.means.numpy()
     walls = background[background[:, 2] > 0.8]
@@ -70,7 +70,7 @@ def test_the_reconstruction_has_wall_and_car_where_the_arrays_had_them(log: Driv
     assert np.abs(walls[:, 1] - 8.0).max() < 0.3
     car = scene.objects["car_0"]
     np.testing.assert_allclose(car.trajectory.positions[0], [12.0, 3.0, 0.75], atol=0.05)
-    # Its rear was seen in five turns of 0.1 s, in which the car goes 0.8 m.
+    # The rear was seen in five revolutions of 0.1 s, during each of which the car moves 0.8 m.
     x, y, z = car.cloud.means.numpy().T
     rear = x[(np.abs(y) < 0.85) & (np.abs(z) < 0.6) & (x < -1.9)]
     assert len(rear) > 10

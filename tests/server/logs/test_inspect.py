@@ -34,7 +34,7 @@ def _moved(log: DrivingLog, *shift: float) -> DrivingLog:
     return dataclasses.replace(log, source=_Moved(log.source, shift))  # type: ignore[arg-type]
 
 
-def test_report_tells_what_the_log_holds(tiny_log: SyntheticLog) -> None:
+def test_report_describes_the_log(tiny_log: SyntheticLog) -> None:
     report = inspect_log(tiny_log)
     assert (report.frames, report.rate) == (3, pytest.approx(10))
     assert report.duration == pytest.approx(0.2)
@@ -50,7 +50,7 @@ def test_report_tells_what_the_log_holds(tiny_log: SyntheticLog) -> None:
     assert report.questions == report.problems == report.gaps == report.drawings == ()
 
 
-def test_report_goes_into_json_and_into_lines(tiny_log: SyntheticLog) -> None:
+def test_report_is_available_as_json_and_text(tiny_log: SyntheticLog) -> None:
     report = inspect_log(tiny_log)
     assert json.loads(json.dumps(report.as_json()))["name"] == tiny_log.name
     text = "\n".join(report.lines())
@@ -113,8 +113,8 @@ def test_drawings_are_written(tiny_log: SyntheticLog, tmp_path: Path) -> None:
     assert read_image(tmp_path / "out/top.png").std() > 10
 
 
-def test_drawn_boxes_enclose_the_vehicles_that_are_seen(tiny_log: SyntheticLog) -> None:
-    """The truth says which pixels show a vehicle: all must lie within the drawn outline."""
+def test_drawn_boxes_enclose_visible_vehicles(tiny_log: SyntheticLog) -> None:
+    """All ground truth pixels of a vehicle lie within the drawn outline."""
     camera, frame = tiny_log.rig["front"], 1
     t_us = int(tiny_log.frame_times_us[frame])
     pose = tiny_log.ego.transform(t_us) @ camera.T_vehicle_camera

@@ -27,7 +27,7 @@ def jam(test_data: Path) -> DrivingLog:
     return open_log(path)
 
 
-def test_poses_and_boxes_survive_the_layout(tiny_log: SyntheticLog, written_kitti: Path) -> None:
+def test_poses_and_boxes_are_preserved(tiny_log: SyntheticLog, written_kitti: Path) -> None:
     log = open_log(written_kitti)
     assert (log.frame_times_us == tiny_log.frame_times_us).all()
     np.testing.assert_allclose(log.ego.positions, tiny_log.ego.positions, atol=1e-8)
@@ -52,27 +52,27 @@ def test_projection_offsets_become_camera_positions(
     np.testing.assert_allclose(
         front.T_vehicle_camera, tiny_log.rig["front"].T_vehicle_camera, atol=1e-9
     )
-    # The layout's projections only shift, so the side camera keeps its place up to the turn.
+    # Rectified projections only shift, so the side camera keeps its distance but not its rotation.
     turned = tiny_log.rig["front_left"].T_vehicle_camera
     offset = left.T_vehicle_camera[:3, 3] - front.T_vehicle_camera[:3, 3]
     expected = turned[:3, 3] - front.T_vehicle_camera[:3, 3]
     assert np.linalg.norm(offset) == pytest.approx(np.linalg.norm(expected))
 
 
-def test_own_motion_is_taken_out_of_sweeps(tiny_log: SyntheticLog, written_kitti: Path) -> None:
+def test_ego_motion_is_compensated_in_sweeps(tiny_log: SyntheticLog, written_kitti: Path) -> None:
     read, given = open_log(written_kitti).lidar(1), tiny_log.lidar(1)
     np.testing.assert_allclose(read.points, given.points, atol=1e-3)
-    # Raw scans keep no times: azimuth gives them back.
+    # Raw scans have no times, so the reader derives them from azimuth.
     assert np.abs(read.offset_us - given.offset_us).max() <= 1
 
 
-def test_uncompensated_points_would_be_wrong(tiny_log: SyntheticLog, written_kitti: Path) -> None:
+def test_uncompensated_points_are_wrong(tiny_log: SyntheticLog, written_kitti: Path) -> None:
     scan = np.fromfile(written_kitti / "training/velodyne/0007/000001.bin", np.float32)
     raw = scan.reshape(-1, 4)[:, :3] + tiny_log.lidar(1).origin
     assert np.abs(raw - tiny_log.lidar(1).points).max() > 0.2
 
 
-def test_boxes_of_all_vehicles_supersede_visible_ones(kitti_folder: Path) -> None:
+def test_surround_boxes_supersede_labels(kitti_folder: Path) -> None:
     training = kitti_folder / "training"
     rows = (training / "label_02/0007.txt").read_text().splitlines()
     (training / "boxes_surround").mkdir()
@@ -80,7 +80,7 @@ def test_boxes_of_all_vehicles_supersede_visible_ones(kitti_folder: Path) -> Non
     assert len(open_log(kitti_folder).tracks) == 2
 
 
-def test_old_spelling_of_calibration_keys_means_the_same(kitti_folder: Path) -> None:
+def test_old_calibration_keys_are_read(kitti_folder: Path) -> None:
     before = open_log(kitti_folder).rig["image_00"].T_vehicle_camera
     path = kitti_folder / "training/calib/0007.txt"
     text = path.read_text()
@@ -106,7 +106,7 @@ def test_one_of_several_sequences_must_be_named(kitti_folder: Path) -> None:
     assert open_log(kitti_folder, sequence="0007").provenance["sequence"] == "0007"
 
 
-def test_oxts_give_the_same_drive_as_poses(kitti_folder: Path) -> None:
+def test_oxts_and_poses_give_the_same_trajectory(kitti_folder: Path) -> None:
     log = open_log(kitti_folder)
     training = kitti_folder / "training"
     (training / "poses/0007.txt").unlink()
@@ -118,7 +118,7 @@ def test_oxts_give_the_same_drive_as_poses(kitti_folder: Path) -> None:
 
 
 def _write_oxts(path: Path, log: DrivingLog) -> None:
-    """Latitude, longitude and yaw of the unit over the rear axle, driving north-east."""
+    """Write latitude, longitude and yaw of the GPS unit, driving north-east."""
     latitude, longitude, course = 49.0, 8.4, 0.7
     meridian = np.pi / 180 * EARTH_RADIUS
     turn = np.array([[np.cos(course), -np.sin(course)], [np.sin(course), np.cos(course)]])
@@ -126,7 +126,7 @@ def _write_oxts(path: Path, log: DrivingLog) -> None:
     for t_us in log.frame_times_us:
         pose = log.ego.transform(int(t_us))
         east, north = turn @ pose[:2, 3]
-        # The unit sits 0.32 m left of the scanner's axis and of the vehicle's.
+        # The unit is 0.32 m left of the scanner and of the centre line.
         yaw = course + float(quaternion_yaw(matrix_to_quaternion(pose[:3, :3])))
         east -= 0.32 * np.sin(yaw)
         north += 0.32 * np.cos(yaw)
@@ -139,7 +139,7 @@ def _write_oxts(path: Path, log: DrivingLog) -> None:
     path.write_text("\n".join(rows))
 
 
-def test_recorded_times_replace_the_even_ones(kitti_folder: Path) -> None:
+def test_recorded_times_replace_default_times(kitti_folder: Path) -> None:
     times = kitti_folder / "training/times/0007.txt"
     times.parent.mkdir()
     times.write_text("0.0\n0.103\n0.205\n")
@@ -224,7 +224,7 @@ BAD_LAYOUTS: dict[str, tuple[Callable[[Path], None], str]] = {
 
 
 @pytest.mark.parametrize("case", BAD_LAYOUTS)
-def test_bad_layout_is_refused_with_its_place(kitti_folder: Path, case: str) -> None:
+def test_bad_layout_is_refused_with_its_location(kitti_folder: Path, case: str) -> None:
     change, message = BAD_LAYOUTS[case]
     change(kitti_folder / "training")
     with pytest.raises(LogError, match=message):
@@ -245,8 +245,8 @@ def test_sample_boxes_stand_on_the_road(jam: DrivingLog) -> None:
         assert np.abs(bottom).max() < 0.12
 
 
-def test_sample_points_in_a_box_fall_into_its_picture(jam: DrivingLog) -> None:
-    """The 2D boxes of the label file were made apart from this reader."""
+def test_sample_points_in_a_box_project_into_its_2d_box(jam: DrivingLog) -> None:
+    """The 2D boxes of the label file are independent of this reader."""
     folder = jam.source.images["image_02"][0].parents[2]  # type: ignore[attr-defined]
     rows = [r.split() for r in (folder / "label_02/0000.txt").read_text().splitlines()]
     camera, track = jam.rig["image_02"], _track(jam, "car_0")
@@ -269,7 +269,7 @@ def _track(log: DrivingLog, object_id: str) -> ObjectTrack:
 
 
 def _points_of(log: DrivingLog, track: ObjectTrack, frame: int) -> np.ndarray:
-    """Points [N, 3] of a sweep inside a box, vehicle frame; the box's own motion is taken out."""
+    """Points [N, 3] of a sweep inside a box, vehicle frame, compensated for the box motion."""
     t_us = int(log.frame_times_us[frame])
     sweep = log.lidar(frame)
     world = apply_transform(log.ego.transform(t_us), sweep.points)
@@ -284,12 +284,12 @@ def _points_of(log: DrivingLog, track: ObjectTrack, frame: int) -> np.ndarray:
 def _project(camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     x, y, z = apply_transform(invert_transform(camera.T_vehicle_camera), points).T
     k = camera.K
-    # Labels count pixel centres as whole numbers.
+    # Labels use integer pixel centres.
     return k[0, 0] * x / z + k[0, 2] - 0.5, k[1, 1] * y / z + k[1, 2] - 0.5
 
 
 @pytest.mark.parametrize("name", ["car_1", "truck_2", "car_0"])
-def test_sample_vehicles_accumulate_sharply(jam: DrivingLog, name: str) -> None:
+def test_sample_vehicle_sweeps_align(jam: DrivingLog, name: str) -> None:
     track = _track(jam, name)
     clouds = []
     for frame in (0, 6, 12, 18):
@@ -301,7 +301,7 @@ def test_sample_vehicles_accumulate_sharply(jam: DrivingLog, name: str) -> None:
     assert np.median(distance) < 0.035
 
 
-def test_sample_road_is_level_where_it_is_driven(jam: DrivingLog) -> None:
+def test_sample_road_is_level_along_the_path(jam: DrivingLog) -> None:
     last = jam.ego.positions[-1]
     heights = []
     for frame in range(0, jam.frame_count, 6):

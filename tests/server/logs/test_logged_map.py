@@ -1,4 +1,4 @@
-"""Lanes that a log comes with: of its own document, of a data set's map beside it, of the drive."""
+"""Lanes of a log: its own, from a dataset map, or from the recorded drive."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ def placed(yaw: float, x: float, y: float) -> np.ndarray:
 
 @pytest.fixture
 def bare(tiny_log):
-    """The drive without lanes of its own."""
+    """The drive without lanes."""
     return replace(tiny_log, lanes=None, logged_map=None)
 
 
 def with_map(log, folder: Path, graph: LaneGraph, T_world_map: np.ndarray):
-    """The drive beside a map whose lanes are ``graph`` in the world."""
+    """The drive with a dataset map that contains ``graph``, given in the world frame."""
     back = invert_transform(T_world_map)
     moved = graph.moved(float(np.arctan2(back[1, 0], back[0, 0])), back[:3, 3])
     path = folder / "lanes.json"
@@ -46,7 +46,7 @@ def with_map(log, folder: Path, graph: LaneGraph, T_world_map: np.ndarray):
     return replace(log, logged_map=LoggedMap(path, T_world_map))
 
 
-def test_a_map_beside_the_log_is_brought_into_its_world(bare, tmp_path):
+def test_a_dataset_map_is_transformed_to_the_world(bare, tmp_path):
     graph = LaneGraph.of([straight("a", (-10, 1.5)), straight("b", (0, -2))])
     log = with_map(bare, tmp_path, graph, placed(0.7, 30, -400))
     found = lanes_of_log(log)
@@ -55,7 +55,7 @@ def test_a_map_beside_the_log_is_brought_into_its_world(bare, tmp_path):
         np.testing.assert_allclose(found.lane(name).centre, lane.centre, atol=1e-3)
 
 
-def test_of_a_whole_town_only_what_is_near_the_drive_is_kept(bare, tmp_path):
+def test_only_lanes_near_the_drive_are_kept(bare, tmp_path):
     near = straight("near", (0, 0), successors=("next",))
     graph = LaneGraph.of([near, straight("next", (60, 0)), straight("far", (4000, 0))])
     found = lanes_of_log(with_map(bare, tmp_path, graph, np.eye(4)))
@@ -63,38 +63,38 @@ def test_of_a_whole_town_only_what_is_near_the_drive_is_kept(bare, tmp_path):
     assert found.lane("near").successors == ("next",)
 
 
-def test_a_map_of_another_place_is_refused_by_name(bare, tmp_path):
+def test_a_map_of_another_place_is_refused(bare, tmp_path):
     log = with_map(bare, tmp_path, LaneGraph.of([straight("a", (9000, 0))]), np.eye(4))
     with pytest.raises(MapError, match=r"lanes\.json: no lane of this map is within 250 m"):
         lanes_of_log(log)
     assert lanes_of_log(log, source="none") is None
 
 
-def test_lanes_of_the_log_itself_come_first(tiny_log, tmp_path):
+def test_lanes_of_the_log_take_precedence(tiny_log, tmp_path):
     own = LaneGraph.of([straight("own", (0, 0))])
     log = replace(tiny_log, lanes=own, logged_map=LoggedMap(tmp_path / "missing", np.eye(4)))
     assert lanes_of_log(log) is own
 
 
-def test_without_a_map_the_drive_is_asked_only_on_request(bare):
+def test_lanes_are_derived_from_the_drive_only_on_request(bare):
     assert lanes_of_log(bare) is None
     gathered = lanes_of_log(bare, source="log")
     assert gathered is None or gathered.accuracy is not None
 
 
-def test_argoverse_2_brings_its_map(written_argoverse2, tmp_path):
+def test_argoverse_2_logs_have_their_map(written_argoverse2, tmp_path):
     folder = Path(shutil.copytree(written_argoverse2, tmp_path / "log"))
     assert open_log(folder).logged_map is None
     (folder / "map").mkdir()
     (folder / "map" / "log_map_archive_x____PIT_city_1.json").write_text("{}")
     log = open_log(folder)
     assert log.logged_map.path == folder / "map"
-    # The world's origin is the first pose, whatever that is in the city.
+    # The world origin is the first pose, so this transform is rigid but arbitrary.
     city = log.logged_map.T_world_map
     np.testing.assert_allclose(city[:3, :3] @ city[:3, :3].T, np.eye(3), atol=1e-9)
 
 
-def test_nuscenes_brings_the_expansion_of_its_town(written_nuscenes, tmp_path):
+def test_nuscenes_logs_use_the_map_expansion_of_their_city(written_nuscenes, tmp_path):
     root = Path(shutil.copytree(written_nuscenes, tmp_path / "set"))
     assert open_log(root).logged_map is None
     tables = next(root.glob("v1.0-*"))
@@ -112,7 +112,7 @@ def test_nuscenes_brings_the_expansion_of_its_town(written_nuscenes, tmp_path):
     np.testing.assert_allclose(log.logged_map.T_world_map, log.provenance["T_world_dataset"])
 
 
-def test_a_real_argoverse_2_drive_runs_on_its_lanes(test_data):
+def test_a_real_argoverse_2_drive_lies_on_its_lanes(test_data):
     path = test_data / "argoverse2"
     if not path.is_dir():
         pytest.skip(f"no sample drive at {path}")

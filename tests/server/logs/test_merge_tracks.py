@@ -1,4 +1,4 @@
-"""Boxes that were found, put beside those that a log has."""
+"""Merging detected tracks with those of a log."""
 
 import numpy as np
 
@@ -15,14 +15,14 @@ def straight(object_id, *, start, speed, first_s=0.0, last_s=4.0, size=(4.4, 1.8
     return ObjectTrack(object_id, object_id.rsplit("_", 1)[0], size, trajectory)
 
 
-def test_a_box_that_the_log_has_is_not_added_again():
+def test_a_track_of_the_log_is_not_added_again():
     given = straight("car_7", start=(10, 0, 0.7), speed=5)
     found = straight("car_0", start=(10.5, 0.3, 0.8), speed=5)
     assert same_object(found, given)
     assert merge_tracks([given], [found]) == (given,)
 
 
-def test_what_the_log_lacks_is_added_under_an_id_of_its_own():
+def test_a_new_track_gets_a_unique_id():
     given = straight("car_0", start=(10, 0, 0.7), speed=5)
     found = straight("car_0", start=(10, 4, 0.7), speed=5)
     ids = [track.object_id for track in merge_tracks([given], [found])]
@@ -30,7 +30,7 @@ def test_what_the_log_lacks_is_added_under_an_id_of_its_own():
     assert len(set(ids)) == 2
 
 
-def test_cars_that_pass_the_same_place_at_other_times_are_two():
+def test_cars_at_the_same_place_at_different_times_are_distinct():
     given = straight("car_0", start=(10, 0, 0.7), speed=5, last_s=1.0)
     found = straight("car_1", start=(10, 0, 0.7), speed=5, first_s=2.0)
     assert not same_object(found, given)

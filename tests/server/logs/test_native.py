@@ -20,7 +20,7 @@ DEVICE = {
 }
 
 
-def test_round_trip_keeps_every_bit(tiny_log: SyntheticLog, written_native: Path) -> None:
+def test_round_trip_is_exact(tiny_log: SyntheticLog, written_native: Path) -> None:
     back = open_log(written_native)
     assert back.name == tiny_log.name
     assert (back.frame_times_us == tiny_log.frame_times_us).all()
@@ -46,7 +46,7 @@ def test_round_trip_keeps_cameras_and_tracks(tiny_log: SyntheticLog, written_nat
         )
 
 
-def test_round_trip_keeps_what_a_camera_really_is(native_folder: Path, tmp_path: Path) -> None:
+def test_round_trip_keeps_recorded_optics(native_folder: Path, tmp_path: Path) -> None:
     _edit(native_folder, lambda m: m["cameras"][0].update(recorded=DEVICE))
     camera = next(iter(open_log(native_folder).rig))
     assert camera.is_pinhole
@@ -55,7 +55,7 @@ def test_round_trip_keeps_what_a_camera_really_is(native_folder: Path, tmp_path:
     assert json.loads((again / "log.json").read_text())["cameras"][0]["recorded"] == DEVICE
 
 
-def test_a_lens_that_is_none_is_refused(native_folder: Path) -> None:
+def test_an_invalid_lens_is_refused(native_folder: Path) -> None:
     wrong = {**DEVICE, "lens": {"model": "fisheye", "k": [1.0]}}
     _edit(native_folder, lambda m: m["cameras"][0].update(recorded=wrong))
     with pytest.raises(LogError, match="k must be 4 finite numbers"):
@@ -89,7 +89,7 @@ def test_log_without_lidar_gives_empty_sweeps(native_folder: Path) -> None:
     assert open_log(native_folder).lidar(0).points.shape == (0, 3)
 
 
-def test_provenance_may_be_left_out(native_folder: Path) -> None:
+def test_provenance_is_optional(native_folder: Path) -> None:
     _edit(native_folder, lambda m: m.pop("provenance"))
     assert open_log(native_folder).provenance == {}
 
@@ -126,7 +126,7 @@ BAD_MANIFESTS: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
 
 
 @pytest.mark.parametrize("case", BAD_MANIFESTS)
-def test_bad_manifest_is_refused_by_name(native_folder: Path, case: str) -> None:
+def test_bad_manifest_is_refused(native_folder: Path, case: str) -> None:
     change, message = BAD_MANIFESTS[case]
     _edit(native_folder, change)
     with pytest.raises(LogError, match=message) as refusal:
@@ -161,7 +161,7 @@ def test_image_of_another_size_is_found(native_folder: Path, suffix: str) -> Non
     assert problem.endswith("000001.png: is 12x10, but the calibration says 120x80")
 
 
-def test_cut_image_is_refused_when_asked_for(native_folder: Path) -> None:
+def test_truncated_image_is_refused_on_access(native_folder: Path) -> None:
     path = native_folder / "images/front/000001.png"
     path.write_bytes(path.read_bytes()[:60])
     with pytest.raises(LogError, match=r"000001\.png: (is not a readable|the image is cut off)"):
@@ -180,14 +180,14 @@ def test_missing_sweep_is_found(native_folder: Path) -> None:
     assert "000002.npz: no such file" in problem
 
 
-def test_cut_sweep_is_refused_when_asked_for(native_folder: Path) -> None:
+def test_truncated_sweep_is_refused_on_access(native_folder: Path) -> None:
     path = native_folder / "lidar/000000.npz"
     path.write_bytes(path.read_bytes()[:500])
     with pytest.raises(LogError, match=r"000000\.npz: expected an \.npz"):
         open_log(native_folder).lidar(0)
 
 
-def test_sweep_with_arrays_that_do_not_fit_is_refused(native_folder: Path) -> None:
+def test_sweep_with_inconsistent_arrays_is_refused(native_folder: Path) -> None:
     np.savez(
         native_folder / "lidar/000000.npz",
         points=np.zeros((4, 3), np.float32),
@@ -205,7 +205,7 @@ def test_sweep_with_pickled_objects_is_not_loaded(native_folder: Path) -> None:
         open_log(native_folder).lidar(0)
 
 
-def test_documented_example_is_a_log(tmp_path: Path) -> None:
+def test_documented_example_is_a_valid_log(tmp_path: Path) -> None:
     page = Path(__file__).resolve().parents[3] / "docs" / "log_format.md"
     example = page.read_text().split("```json")[1].split("```")[0]
     (tmp_path / "log.json").write_text(example)
@@ -225,7 +225,7 @@ def test_documented_example_is_a_log(tmp_path: Path) -> None:
     assert log.tracks[0].object_id == "car_0"
 
 
-def test_times_of_images_survive(tiny_log: SyntheticLog, tmp_path: Path) -> None:
+def test_image_times_are_preserved(tiny_log: SyntheticLog, tmp_path: Path) -> None:
     late = {"front_left": tiny_log.frame_times_us - [0, 3000, 9000]}
     given = dataclasses.replace(tiny_log, image_times_us=late)
     read = open_log(write_native_log(given, tmp_path / "late"))
@@ -242,7 +242,7 @@ def test_times_of_images_survive(tiny_log: SyntheticLog, tmp_path: Path) -> None
         ({"front": [0, 1, 10**9]}, "front: ego poses cover"),
     ],
 )
-def test_bad_times_of_images_are_refused(
+def test_bad_image_times_are_refused(
     native_folder: Path, times: dict[str, list[int]], message: str
 ) -> None:
     manifest = native_folder / "log.json"

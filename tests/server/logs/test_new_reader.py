@@ -1,4 +1,4 @@
-"""A reader of a little format, registered as one from outside would be, and its contract."""
+"""A custom reader of a minimal format, registered from outside the package."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ HEADER = "time_us x y z qw qx qy qz"
 
 
 def write_little(log: DrivingLog, folder: Path) -> None:
-    """``ego.txt``, ``camera.txt``, one file a box, one image and one table of points a frame."""
+    """Write ``ego.txt``, ``camera.txt``, a file per box, and an image and points per frame."""
     for name in ("boxes", "images", "points"):
         (folder / name).mkdir(parents=True)
     _write_path(folder / "ego.txt", log.ego)
@@ -43,7 +43,7 @@ def _write_path(path: Path, given: Trajectory) -> None:
 
 
 class LittleReader:
-    """Reads what :func:`write_little` writes."""
+    """Reads the format of :func:`write_little`."""
 
     name = "little"
     expects = "ego.txt, camera.txt, boxes/<id>_<size>.txt, images/<frame>.png, points/<frame>.txt"
@@ -100,7 +100,7 @@ class LittleSource:
 
 @pytest.fixture(autouse=True)
 def registered() -> Iterator[None]:
-    """The reader among the others while a test runs."""
+    """Register the reader for one test."""
     before = list(READERS)
     register_reader(LittleReader())
     yield
@@ -120,6 +120,6 @@ class TestLittleReader(ReaderContract):
         return written_little
 
 
-def test_a_name_is_registered_once() -> None:
+def test_registering_a_name_twice_is_refused() -> None:
     with pytest.raises(ValueError, match="'little' is registered already"):
         register_reader(LittleReader())

@@ -13,7 +13,7 @@ def test_missing_folder_is_named(tmp_path: Path) -> None:
         open_log(tmp_path / "nowhere")
 
 
-def test_empty_folder_lists_all_formats_and_what_they_expect(tmp_path: Path) -> None:
+def test_empty_folder_lists_all_formats(tmp_path: Path) -> None:
     with pytest.raises(LogError, match=r"(?s)not a log.*native: log\.json.*kitti: .*velodyne"):
         open_log(tmp_path)
 
@@ -28,7 +28,7 @@ def test_named_format_is_not_guessed(written_native: Path) -> None:
         open_log(written_native, format="kitti")
 
 
-def test_damage_that_a_reader_does_not_foresee_is_a_log_error(native_folder, monkeypatch):
+def test_unexpected_reader_errors_become_log_errors(native_folder, monkeypatch):
     def fail(self, path, *, sequence=None):
         raise KeyError("a token")
 

@@ -1,4 +1,4 @@
-"""Damage in tables that shows only where values are converted."""
+"""Table damage that surfaces only when values are converted."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from real2sim_server.logs import LogError
 from real2sim_server.logs.readers.files import ParquetFile, read_feather
 
 
-def test_text_that_is_none_is_an_error_of_the_file(tmp_path):
+def test_invalid_text_is_refused(tmp_path):
     good = "a text that can be found"
     file = tmp_path / "a.feather"
     feather.write_feather(pa.table({"t": [good]}), file, compression="uncompressed")
@@ -24,7 +24,7 @@ def test_text_that_is_none_is_an_error_of_the_file(tmp_path):
         read_feather(file, ["t"])
 
 
-def test_offsets_that_lead_out_of_the_file_are_not_followed(tmp_path):
+def test_offsets_beyond_the_file_are_refused(tmp_path):
     good = "a text that can be found"
     file = tmp_path / "a.feather"
     feather.write_feather(pa.table({"t": [good]}), file, compression="uncompressed")
@@ -36,7 +36,7 @@ def test_offsets_that_lead_out_of_the_file_are_not_followed(tmp_path):
         read_feather(file, ["t"])
 
 
-def test_names_of_columns_that_are_no_text_are_an_error_of_the_file(tmp_path):
+def test_invalid_column_names_in_feather_are_refused(tmp_path):
     name = "a_name_that_can_be_found"
     file = tmp_path / "a.feather"
     feather.write_feather(pa.table({name: [1]}), file, compression="uncompressed")
@@ -45,7 +45,7 @@ def test_names_of_columns_that_are_no_text_are_an_error_of_the_file(tmp_path):
         read_feather(file, [name])
 
 
-def test_a_damaged_name_of_a_column_is_told(tmp_path):
+def test_invalid_column_names_in_parquet_are_refused(tmp_path):
     path = tmp_path / "damaged.parquet"
     pq.write_table(pa.table({"column": [1.0]}), path)
     path.write_bytes(path.read_bytes().replace(b"column", b"co\xffumn"))

@@ -1,4 +1,4 @@
-"""Typical mistakes of those who write their own logs: each is asked about, and no good log is."""
+"""Typical mistakes in user-written logs raise questions; good logs do not."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Manifest = dict[str, Any]
 
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A log as a user writes one, long enough that everything has moved."""
+    """A user-written log, long enough for all movers to move."""
     log = generate_log(replace(TINY, frames=10, width=24, height=16))
     return write_native_log(log, tmp_path_factory.mktemp("own") / "drive")
 
@@ -50,7 +50,7 @@ def change(folder: Path, how: Callable[[Manifest], None]) -> Path:
 
 
 def change_sweeps(folder: Path, how: Callable[[np.ndarray, dict[str, np.ndarray]], None]) -> None:
-    """``how`` gets ``T_world_vehicle`` of each frame and the arrays of its sweep."""
+    """Apply ``how(T_world_vehicle, arrays)`` to the sweep of each frame."""
     ego = json.loads((folder / "log.json").read_text())["ego"]
     for frame, path in enumerate(sorted((folder / "lidar").iterdir())):
         with np.load(path) as file:
@@ -63,7 +63,7 @@ def poses_of(content: Manifest) -> list[Manifest]:
     return [content["ego"], *content["tracks"]]
 
 
-def test_a_good_log_raises_no_question(drive: Path) -> None:
+def test_a_good_log_raises_no_questions(drive: Path) -> None:
     assert inspect_log(open_log(drive)).questions == ()
 
 
@@ -178,13 +178,13 @@ MISTAKES: dict[str, tuple[Callable[[Manifest], None], str]] = {
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
-def test_a_mistake_is_asked_about(own: Path, mistake: str) -> None:
+def test_a_mistake_raises_a_question(own: Path, mistake: str) -> None:
     how, question = MISTAKES[mistake]
     questions = inspect_log(open_log(change(own, how))).questions
     assert any(re.search(question, p) for p in questions), questions
 
 
-def test_points_in_the_world_frame_are_asked_about(own: Path) -> None:
+def test_points_in_the_world_frame_raise_a_question(own: Path) -> None:
     def moved(T_world_vehicle: np.ndarray, sweep: dict[str, np.ndarray]) -> None:
         sweep["points"] = apply_transform(T_world_vehicle, sweep["points"]).astype(np.float32)
 
@@ -193,7 +193,7 @@ def test_points_in_the_world_frame_are_asked_about(own: Path) -> None:
     assert any("are points in the world's frame?" in p for p in questions), questions
 
 
-def test_intensities_of_a_byte_are_asked_about(own: Path) -> None:
+def test_intensities_up_to_255_raise_a_question(own: Path) -> None:
     def scaled(_: np.ndarray, sweep: dict[str, np.ndarray]) -> None:
         sweep["intensity"] = sweep["intensity"] * 255
 
@@ -202,7 +202,7 @@ def test_intensities_of_a_byte_are_asked_about(own: Path) -> None:
     assert any("LiDAR intensity is up to" in p for p in questions), questions
 
 
-def test_training_far_from_zero_is_refused(own: Path) -> None:
+def test_training_far_from_the_origin_is_refused(own: Path) -> None:
     with pytest.raises(
         LogError, match=r"5,411 km from the world's origin.* only move in steps of 0\.5 m"
     ):
@@ -228,7 +228,7 @@ def test_misspelt_keys_are_refused(own: Path, where: str, key: str, meant: str) 
         open_log(change(own, misspelt))
 
 
-def test_a_vehicle_that_only_stands_raises_no_question(own: Path) -> None:
+def test_a_stationary_ego_raises_no_questions_about_its_motion(own: Path) -> None:
     def parked(content: Manifest) -> None:
         for name in ("positions", "quaternions"):
             content["ego"][name] = [content["ego"][name][0]] * len(content["ego"][name])

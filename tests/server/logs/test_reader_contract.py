@@ -10,7 +10,7 @@ from .reader_contract import ReaderContract
 
 
 class TestKnownReaders(ReaderContract):
-    """Every reader by a drive that the fixture ``written_<name>`` has put down in its layout."""
+    """Every reader with the drive of its fixture ``written_<name>``."""
 
     @pytest.fixture(params=[*(reader.name for reader in READERS), "kitti_jam"])
     def folder(self, request: pytest.FixtureRequest) -> Path:

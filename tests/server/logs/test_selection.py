@@ -1,4 +1,4 @@
-"""A part of a log: the same drive with less of it."""
+"""Selections of frames and cameras of a log."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from real2sim_server.logs import DrivingLog, LogError, LogSelection, same_part, 
 from real2sim_server.synthetic import SyntheticLog
 
 
-def test_a_stretch_keeps_images_sweeps_and_poses_of_its_frames(tiny_log: SyntheticLog) -> None:
+def test_a_selection_keeps_images_sweeps_and_poses(tiny_log: SyntheticLog) -> None:
     part = select_from_log(tiny_log, LogSelection(first=1, every=2))
     assert part.frame_times_us.tolist() == tiny_log.frame_times_us[1::2].tolist()
     camera = tiny_log.rig.names[0]
@@ -21,7 +21,7 @@ def test_a_stretch_keeps_images_sweeps_and_poses_of_its_frames(tiny_log: Synthet
         assert np.allclose(part.ego.transform(t_us), tiny_log.ego.transform(t_us), atol=1e-12)
 
 
-def test_the_path_and_boxes_end_with_the_stretch(tiny_log: SyntheticLog) -> None:
+def test_ego_and_tracks_are_cut_to_the_selection(tiny_log: SyntheticLog) -> None:
     part = select_from_log(tiny_log, LogSelection(first=1, stop=3))
     taken = [part.image_time_us(c, f) for c in part.rig.names for f in range(part.frame_count)]
     instants = [*taken, *part.frame_times_us.tolist()]
@@ -34,14 +34,14 @@ def test_the_path_and_boxes_end_with_the_stretch(tiny_log: SyntheticLog) -> None
         assert np.allclose(track.trajectory.transform(t_us), whole.trajectory.transform(t_us))
 
 
-def test_only_selected_cameras_are_left_in_the_log_s_order(tiny_log: SyntheticLog) -> None:
+def test_selected_cameras_keep_the_order_of_the_log(tiny_log: SyntheticLog) -> None:
     names = tiny_log.rig.names
     part = select_from_log(tiny_log, LogSelection(cameras=(names[-1], names[0])))
     assert part.rig.names == ((names[0], names[-1]) if len(names) > 1 else names)
     assert set(part.image_times_us) <= set(part.rig.names)
 
 
-def test_a_part_of_a_part_is_told_in_numbers_of_the_whole(tiny_log: SyntheticLog) -> None:
+def test_nested_selections_use_frame_numbers_of_the_whole_log(tiny_log: SyntheticLog) -> None:
     part = select_from_log(tiny_log, LogSelection(first=1))
     second = select_from_log(part, LogSelection(first=1, every=2))
     again = same_part(tiny_log, second.provenance)
@@ -49,7 +49,7 @@ def test_a_part_of_a_part_is_told_in_numbers_of_the_whole(tiny_log: SyntheticLog
     assert again.provenance["selection"] == second.provenance["selection"]
 
 
-def test_the_same_part_of_a_part_is_itself(tiny_log: SyntheticLog) -> None:
+def test_same_part_returns_the_log_itself_when_it_matches(tiny_log: SyntheticLog) -> None:
     part = select_from_log(tiny_log, LogSelection(first=1))
     assert same_part(part, part.provenance) is part
     assert same_part(tiny_log, tiny_log.provenance) is tiny_log
@@ -66,7 +66,7 @@ def test_the_same_part_of_a_part_is_itself(tiny_log: SyntheticLog) -> None:
         (LogSelection(cameras=()), "has cameras"),
     ],
 )
-def test_what_the_log_lacks_is_refused(
+def test_invalid_selections_are_refused(
     tiny_log: DrivingLog, selection: LogSelection, reason: str
 ) -> None:
     with pytest.raises(LogError, match=reason):

@@ -32,13 +32,13 @@ def found(drive: DrivingLog) -> tuple[ObjectTrack, ...]:
 
 @dataclasses.dataclass(frozen=True)
 class _Score:
-    """How well tracks follow the moving objects of a log that can be seen.
+    """Accuracy of tracks against the visible moving objects of a log.
 
     Attributes:
-        seen: sightings: a moving object within NEAR with at least SEEN points, per frame.
+        seen: number of sightings: moving objects within NEAR with at least SEEN points, per frame.
         recall: fraction of the sightings with a track within 2.5 m.
-        errors, turns: [m] and [rad] of those.
-        matched: ids of the tracks.
+        errors, turns: position errors [m] and heading errors [rad] of the matched sightings.
+        matched: ids of the matched tracks.
     """
 
     seen: int
@@ -81,14 +81,14 @@ def test_moving_vehicles_nearby_are_found(
     assert np.median(score.turns) < np.radians(2)
 
 
-def test_nothing_that_stands_is_taken_for_moving(
+def test_stationary_objects_are_not_tracked(
     drive: DrivingLog, found: tuple[ObjectTrack, ...]
 ) -> None:
     score = _score(drive, found, near=100)
     assert {t.object_id for t in found} == score.matched
 
 
-def test_boxes_stand_on_the_road_and_are_named(found: tuple[ObjectTrack, ...]) -> None:
+def test_boxes_rest_on_the_road_and_have_names(found: tuple[ObjectTrack, ...]) -> None:
     assert len(found) >= 3
     for track in found:
         category, number = track.object_id.rsplit("_", 1)
@@ -97,7 +97,7 @@ def test_boxes_stand_on_the_road_and_are_named(found: tuple[ObjectTrack, ...]) -
         assert np.abs(bottom).max() < 0.25
 
 
-def test_same_log_gives_the_same_tracks(drive: DrivingLog) -> None:
+def test_tracking_is_reproducible(drive: DrivingLog) -> None:
     short = dataclasses.replace(drive, frame_times_us=drive.frame_times_us[:8])
     options = TrackingOptions(least_distance=1.0)
     one, two = (track_moving_objects(short, options) for _ in range(2))
@@ -106,7 +106,7 @@ def test_same_log_gives_the_same_tracks(drive: DrivingLog) -> None:
         assert (a.trajectory.positions == b.trajectory.positions).all()
 
 
-def test_log_without_points_has_nothing_that_moves(drive: DrivingLog) -> None:
+def test_log_without_points_has_no_tracks(drive: DrivingLog) -> None:
     @dataclasses.dataclass(frozen=True)
     class Dark:
         def image(self, camera: str, frame: int) -> np.ndarray:
@@ -121,7 +121,7 @@ def test_log_without_points_has_nothing_that_moves(drive: DrivingLog) -> None:
 
 @pytest.mark.slow
 def test_sample_jam_is_tracked(test_data: Path) -> None:
-    """Boxes of the sample were made by registration of the same scans, with hand-given regions."""
+    """The reference boxes come from scan registration with manually selected regions."""
     path = test_data / "kitti_jam"
     if not path.is_dir():
         pytest.skip(f"no sample drive at {path}")
@@ -143,7 +143,7 @@ def test_ground_follows_a_slope_below_a_truck() -> None:
     np.testing.assert_allclose(ground.at(places), 0.03 * places[:, 0], atol=0.15)
 
 
-def test_smoother_finds_a_straight_motion_and_bridges_a_gap() -> None:
+def test_smoother_recovers_straight_motion_across_a_gap() -> None:
     times = np.arange(20) * 0.1
     way = np.stack([3 + 8 * times, 1 - 2 * times], axis=1)
     noise = np.random.default_rng(0).normal(0, 0.1, way.shape)
@@ -154,8 +154,8 @@ def test_smoother_finds_a_straight_motion_and_bridges_a_gap() -> None:
     assert np.abs(states[5:15, 2:] - [8, -2]).max() < 0.5
 
 
-def test_witness_tells_gone_from_hidden() -> None:
-    """A wall at 20 m, and before its middle a board at 10 m."""
+def test_rays_distinguish_free_space_from_occlusion() -> None:
+    """A wall at 20 m, with a board at 10 m in front of its centre."""
     y, z = (v.ravel() for v in np.meshgrid(np.linspace(-8, 8, 400), np.linspace(-1, 1, 40)))
     board = np.abs(y) < 2
     distance = np.where(board, 10.0, 20.0)

@@ -39,14 +39,14 @@ def folder(written_waymo_v1: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(written_waymo_v1, tmp_path / "waymo"))
 
 
-def test_checksum_is_the_published_one() -> None:
-    # RFC 3720, B.4: CRC-32C of 32 zero bytes is 0x8a9136aa; TFRecord turns it and adds to it.
+def test_checksum_matches_rfc_3720() -> None:
+    # RFC 3720, B.4: CRC-32C of 32 zero bytes is 0x8a9136aa. TFRecord rotates it, adds a constant.
     crc = 0x8A9136AA
     turned = (crc >> 15 | crc << 17) & 0xFFFFFFFF
     assert masked_crc32c(bytes(32)) == (turned + 0xA282EAD8) & 0xFFFFFFFF
 
 
-def test_world_far_from_its_origin_loses_nothing(log: DrivingLog, tiny_log: SyntheticLog) -> None:
+def test_large_world_coordinates_keep_precision(log: DrivingLog, tiny_log: SyntheticLog) -> None:
     assert (log.frame_times_us == tiny_log.frame_times_us).all()
     np.testing.assert_allclose(log.ego.positions, tiny_log.ego.positions, atol=1e-10)
 
@@ -58,7 +58,7 @@ def test_width_and_length_are_not_swapped(log: DrivingLog, tiny_log: SyntheticLo
     assert all(length > width for length, width, _ in sizes.values())
 
 
-def test_boxes_are_placed(log: DrivingLog, tiny_log: SyntheticLog) -> None:
+def test_boxes_have_their_poses(log: DrivingLog, tiny_log: SyntheticLog) -> None:
     names = log.provenance["track_ids"]
     read = {names[t.object_id]: t.trajectory for t in log.tracks}
     for track in tiny_log.tracks:
@@ -68,18 +68,18 @@ def test_boxes_are_placed(log: DrivingLog, tiny_log: SyntheticLog) -> None:
             )
 
 
-def test_points_come_back_to_the_size_of_pixels(log: DrivingLog, tiny_log: SyntheticLog) -> None:
+def test_points_round_trip_within_a_range_pixel(log: DrivingLog, tiny_log: SyntheticLog) -> None:
     read, given = log.lidar(1), tiny_log.lidar(1)
     distance, nearest = cKDTree(given.points).query(read.points)
     far = np.linalg.norm(given.points[nearest] - given.origin, axis=1)
-    # Half a row is 0.25 degrees high.
+    # Half a row is 0.25 degrees.
     assert (distance < 0.005 * far).all()
     assert len(read.points) > 0.95 * len(given.points)
     azimuth = np.arctan2(read.points[:, 1], read.points[:, 0] - read.origin[0])
     np.testing.assert_allclose(read.offset_us, -azimuth / (2 * np.pi) * 1e5, atol=1)
 
 
-def test_readout_is_told(log: DrivingLog) -> None:
+def test_rolling_shutter_readout_is_in_the_provenance(log: DrivingLog) -> None:
     shutter = log.provenance["rolling_shutter"]["front"]
     assert shutter["direction"] == "left_to_right"
     assert shutter["readout_us"] == pytest.approx(40_000, abs=1)
@@ -97,12 +97,12 @@ def test_sample_has_its_cameras_and_boxes(sample: DrivingLog) -> None:
     assert len(sample.tracks) == 75
     counts = {c: sum(t.category == c for t in sample.tracks) for c in ("car", "pedestrian", "sign")}
     trucks = sum(t.category == "truck" for t in sample.tracks)
-    # The file's own statistics: 37 vehicles, 12 pedestrians, 25 signs, 1 cyclist.
+    # Statistics of the file: 37 vehicles, 12 pedestrians, 25 signs, 1 cyclist.
     assert counts["car"] + trucks == 37
     assert (counts["pedestrian"], counts["sign"]) == (12, 25)
 
 
-def test_sample_frame_is_the_middle_of_the_turn(sample: DrivingLog) -> None:
+def test_sample_frame_time_is_the_middle_of_the_revolution(sample: DrivingLog) -> None:
     assert sample.image_time_us("front", 0) == sample.frame_times_us[0]
     offsets = {c: sample.image_time_us(c, 0) - sample.frame_times_us[0] for c in sample.rig.names}
     assert offsets["side_left"] == pytest.approx(-30_000, abs=10)
@@ -110,8 +110,8 @@ def test_sample_frame_is_the_middle_of_the_turn(sample: DrivingLog) -> None:
     assert len(sample.lidar(0).points) == 0
 
 
-def test_sample_images_are_straightened(sample: DrivingLog) -> None:
-    """A pinhole shows each direction where the lens's own formula looks it up."""
+def test_sample_images_are_undistorted(sample: DrivingLog) -> None:
+    """The undistorted image samples each direction where the distortion model projects it."""
     lens = sample.source.cameras["front"].lens  # type: ignore[attr-defined]
     k1, k2, p1, p2, k3 = lens.distortion
     x, y = 0.4, -0.25
@@ -126,10 +126,8 @@ def test_sample_images_are_straightened(sample: DrivingLog) -> None:
     assert (image[[0, -1]].max(axis=(1, 2)) > 0).all()
 
 
-def test_sample_boxes_project_onto_the_images_as_the_dataset_itself_projects_them(
-    sample: DrivingLog, test_data: Path
-) -> None:
-    """The frame holds the 2D bounds of its boxes in all images: two camera models must agree."""
+def test_sample_boxes_project_like_the_dataset_labels(sample: DrivingLog, test_data: Path) -> None:
+    """Projected boxes match the 2D bounds stored in the frame."""
     compared = 0
     for camera, key, bounds in _published_bounds(test_data / "waymo/one_frame.tfrecord"):
         names = {v: k for k, v in sample.provenance["track_ids"].items()}
@@ -137,7 +135,7 @@ def test_sample_boxes_project_onto_the_images_as_the_dataset_itself_projects_the
         lens = sample.source.cameras[camera].lens  # type: ignore[attr-defined]
         corners = _corners_in_camera(sample, camera, track)
         level = corners[:, :2] / corners[:, 2:]
-        # Beyond this the lens's polynomial turns back, and no projection means anything.
+        # Beyond this angle the distortion polynomial is not monotonic.
         if (corners[:, 2] < 0.5).any() or np.linalg.norm(level, axis=1).max() > 0.9:
             continue
         pinhole = level * np.diag(sample.rig[camera].K)[:2] + sample.rig[camera].K[:2, 2]
@@ -149,7 +147,7 @@ def test_sample_boxes_project_onto_the_images_as_the_dataset_itself_projects_the
 
 
 def _published_bounds(path: Path) -> list[tuple[str, str, list[float]]]:
-    """Camera, track and left, top, right, bottom of ``projected_lidar_labels``."""
+    """Camera, track and bounds (left, top, right, bottom) of ``projected_lidar_labels``."""
     names = {1: "front", 2: "front_left", 3: "front_right", 4: "side_left", 5: "side_right"}
     frame = ProtoMessage(read_record(path, list_records(path)[0]), "frame")
     found = []
@@ -169,7 +167,7 @@ def _corners_in_camera(log: DrivingLog, camera: str, track: ObjectTrack) -> np.n
     return apply_transform(to_camera, signs * np.array(track.size))
 
 
-def test_a_frame_without_a_sweep_is_left_out_and_told(
+def test_a_frame_without_a_sweep_is_omitted_and_reported(
     waymo_v1: ModuleType, tiny_log: SyntheticLog, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     laser = waymo_v1._laser
@@ -194,25 +192,25 @@ def test_broken_record_is_named(folder: Path) -> None:
         open_log(folder)
 
 
-def test_cut_file_is_named(folder: Path) -> None:
+def test_truncated_file_is_named(folder: Path) -> None:
     path = folder / "tiny.tfrecord"
     path.write_bytes(path.read_bytes()[:-100])
     with pytest.raises(LogError, match=r"tiny\.tfrecord at byte \d+: .*cut off"):
         open_log(folder)
 
 
-def test_other_file_is_named(folder: Path) -> None:
+def test_unrelated_file_is_named(folder: Path) -> None:
     (folder / "tiny.tfrecord").write_bytes(b"nothing of the kind, but long enough")
     with pytest.raises(LogError, match=r"tiny\.tfrecord at byte 0: .*not a TFRecord"):
         open_log(folder)
 
 
-def test_message_that_is_none_is_named() -> None:
+def test_invalid_message_is_named() -> None:
     with pytest.raises(LogError, match="here: is not a protocol-buffer message"):
         ProtoMessage(b"\x0a\xff\x01", "here")
 
 
-def test_packed_numbers_that_are_cut_off_are_an_error():
+def test_truncated_packed_numbers_are_refused():
     message = ProtoMessage(b"\x1a\x02\x01\x80", "segment")
     with pytest.raises(LogError, match="segment: field 3 is cut off"):
         message.integers(3)

@@ -25,13 +25,13 @@ def log(written_waymo_v2: Path) -> DrivingLog:
     return open_log(written_waymo_v2)
 
 
-def test_times_and_poses_come_back_exactly(log: DrivingLog, tiny_log: SyntheticLog) -> None:
+def test_times_and_poses_round_trip_exactly(log: DrivingLog, tiny_log: SyntheticLog) -> None:
     assert (log.frame_times_us == tiny_log.frame_times_us).all()
     np.testing.assert_allclose(log.ego.positions, tiny_log.ego.positions, rtol=0, atol=1e-12)
     np.testing.assert_allclose(log.ego.quaternions, tiny_log.ego.quaternions, rtol=0, atol=1e-15)
 
 
-def test_calibrations_come_back_exactly(log: DrivingLog, tiny_log: SyntheticLog) -> None:
+def test_calibrations_round_trip_exactly(log: DrivingLog, tiny_log: SyntheticLog) -> None:
     assert log.rig.names == tiny_log.rig.names
     for one, two in zip(log.rig, tiny_log.rig, strict=True):
         assert (one.width, one.height) == (two.width, two.height)
@@ -39,7 +39,7 @@ def test_calibrations_come_back_exactly(log: DrivingLog, tiny_log: SyntheticLog)
         np.testing.assert_allclose(one.T_vehicle_camera, two.T_vehicle_camera, rtol=0, atol=1e-15)
 
 
-def test_boxes_come_back_exactly(log: DrivingLog, tiny_log: SyntheticLog) -> None:
+def test_boxes_round_trip_exactly(log: DrivingLog, tiny_log: SyntheticLog) -> None:
     names = log.provenance["track_ids"]
     read = {names[t.object_id]: t for t in log.tracks}
     assert set(read) == {t.object_id for t in tiny_log.tracks}
@@ -54,12 +54,12 @@ def test_boxes_come_back_exactly(log: DrivingLog, tiny_log: SyntheticLog) -> Non
             )
 
 
-def test_images_come_back_exactly(log: DrivingLog, tiny_log: SyntheticLog) -> None:
+def test_images_round_trip_exactly(log: DrivingLog, tiny_log: SyntheticLog) -> None:
     for camera in log.rig.names:
         assert (log.image(camera, 2) == tiny_log.image(camera, 2)).all()
 
 
-def test_points_come_back_to_the_rounding_of_range_images(
+def test_points_round_trip_within_range_image_rounding(
     log: DrivingLog, tiny_log: SyntheticLog
 ) -> None:
     for frame in range(log.frame_count):
@@ -88,7 +88,7 @@ def test_segment_with_lidar_only_opens(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("lost", ["row", "image", "laser"])
-def test_a_frame_without_a_sweep_is_left_out_and_told(
+def test_a_frame_without_a_sweep_is_omitted_and_reported(
     folder: Path, tiny_log: SyntheticLog, lost: str
 ) -> None:
     if lost == "image":
@@ -99,7 +99,7 @@ def test_a_frame_without_a_sweep_is_left_out_and_told(
         start_us = _column(folder, "lidar", "key.frame_timestamp_micros")[1]
         _keep_rows(folder, "lidar", lambda row: row["key.frame_timestamp_micros"] != start_us)
     else:
-        _set(folder, "lidar", "key.laser_name", 1, 2)  # of another laser than the other frames
+        _set(folder, "lidar", "key.laser_name", 1, 2)  # another laser than in the other frames
         path = next((folder / "lidar_calibration").glob("*.parquet"))
         table = pq.read_table(path)
         pq.write_table(pa.concat_tables([table, table]), path)
@@ -114,15 +114,15 @@ def test_a_frame_without_a_sweep_is_left_out_and_told(
     assert "frames without a LiDAR sweep, left out: 1, at 0.10 s" in told.output
 
 
-def test_camera_without_images_is_left_out_and_named(folder: Path) -> None:
+def test_camera_without_images_is_omitted_and_named(folder: Path) -> None:
     _keep_rows(folder, "camera_image", lambda row: row["key.camera_name"] != 3)
     log = open_log(folder)
     assert log.rig.names == ("front", "front_left")
     assert log.provenance["cameras_without_images"] == ["front_right"]
 
 
-def test_real_poses_of_a_segment_open(test_data: Path) -> None:
-    """199 poses stored as float32, 15 km from the origin of their world."""
+def test_real_segment_poses_open(test_data: Path) -> None:
+    """199 float32 poses, 15 km from the world origin."""
     path = test_data / "waymo/v2"
     if not path.is_dir():
         pytest.skip(f"no sample poses at {path}")
@@ -210,7 +210,7 @@ def folder(written_waymo_v2: Path, tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("case", BAD_SEGMENTS)
-def test_bad_segment_is_refused_with_its_place(folder: Path, case: str) -> None:
+def test_bad_segment_is_refused_with_its_location(folder: Path, case: str) -> None:
     change, message = BAD_SEGMENTS[case]
     change(folder)
     with pytest.raises(LogError, match=message):

@@ -1,9 +1,9 @@
-"""Writes a DrivingLog in the layout of the Waymo Open Dataset v2 (see readers/waymo_v2.py).
+"""Write a DrivingLog in the layout of the Waymo Open Dataset v2 (see readers/waymo_v2.py).
 
-What is exact in a round trip: times, poses, box sizes and calibrations (float64), images (with
-``image_format="png"``; the data set itself holds JPEG). Boxes have only a heading, so a box keeps
-its turn about the vehicle's z axis only. Points come back within 0.1 mm for worlds of up to a
-kilometre: ranges, and the poses of pixels, are float32.
+Round trips are exact for times, poses, box sizes and calibrations (float64), and for images with
+``image_format="png"`` (the data set itself holds JPEG). Boxes keep only their rotation about the
+vehicle's z axis. Ranges and pixel poses are float32, so points are accurate to 0.1 mm in worlds of
+up to 1 km.
 """
 
 from __future__ import annotations
@@ -52,12 +52,12 @@ TYPES = {"pedestrian": 2, "sign": 3, "cyclist": 4, "other": 0}
 VEHICLE = 1
 GLOBAL_SHUTTER = 5
 OFF_GRID = 0.02
-"""How far from the centre of its cell, in cells, a point may lie in a range image."""
+"""Largest distance of a point from the centre of its range image cell [cells]."""
 
 
 @dataclass(frozen=True, eq=False)
 class RangeGrid:
-    """The beams of a turning LiDAR.
+    """The beams of a spinning LiDAR.
 
     Attributes:
         inclinations: [H] float64 [rad], ascending.
@@ -70,7 +70,7 @@ class RangeGrid:
 
 @dataclass(frozen=True, eq=False)
 class _Layout:
-    """Camera numbers by name, the LiDAR's beams if there are any, suffix of images."""
+    """Camera numbers by name, the LiDAR's beams or None, and the image suffix."""
 
     numbers: Mapping[str, int]
     grid: RangeGrid | None
@@ -86,15 +86,15 @@ def write_waymo_v2(
     grid: RangeGrid | None = None,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> Path:
-    """Write ``log`` to the folder ``path``, which appears only when it is complete.
+    """Write ``log`` to the folder ``path``, which appears only once it is complete.
 
     Args:
-        log: with at most five cameras and an upright sensor on the vehicle.
-        path: a folder that does not exist yet, or an empty one.
-        segment: name of the files; by default the log's name.
+        log: a log with at most five cameras and an upright LiDAR.
+        path: a new or empty folder.
+        segment: name of the files, by default the log's name.
         image_format: ``png`` (exact) or ``jpg`` (quality 95).
-        grid: the LiDAR's beams; by default those of the synthetic generator. Points must have
-            been measured along them.
+        grid: the LiDAR's beams, by default those of the synthetic generator. Points must lie on
+            them.
         on_progress: called with (done, total) after each frame.
 
     Returns:
@@ -151,7 +151,7 @@ def _synthetic_grid(log: DrivingLog) -> RangeGrid | None:
 
 
 class _Writer:
-    """One Parquet file per component; every frame becomes a row group."""
+    """One Parquet file per component, one row group per frame."""
 
     def __init__(self, folder: Path, segment: str) -> None:
         self._folder, self._segment = folder, segment
@@ -247,7 +247,7 @@ def _turn_us(log: DrivingLog) -> int:
 
 
 def _start_us(log: DrivingLog, frame: int, numbers: Mapping[str, int], turn_us: int) -> int:
-    """A frame's time stamp is the start of its turn; its pose holds half a turn later."""
+    """Start of the frame's revolution [us]. Its pose applies half a revolution later."""
     t_us = int(log.frame_times_us[frame])
     for name, number in numbers.items():
         if number == FRONT and log.image_time_us(name, frame) != t_us:
@@ -332,7 +332,7 @@ def _image_cells(prefix: str, image: NDArray[np.float32]) -> dict[str, Any]:
 def _range_image(
     log: DrivingLog, frame: int, sweep: LidarSweep, grid: RangeGrid
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """[H, W, 4] range, intensity, elongation, no-label zone; [H, W, 6] poses of the pixels."""
+    """[H, W, 4] range, intensity, elongation, no-label zone; and pixel poses [H, W, 6]."""
     t_us = int(log.frame_times_us[frame])
     offsets = sweep.offset_us.astype(np.float64)
     moved = _ego_at(log, t_us + offsets)
@@ -351,7 +351,7 @@ def _range_image(
 def _cells(
     log: DrivingLog, frame: int, grid: RangeGrid, azimuth: Float, elevation: Float
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Row and column of every point. Raises LogError where points are off the grid."""
+    """Row and column of every point. Raises LogError if points are off the grid."""
     where = f"log {log.name!r}, sweep of frame {frame}"
     column = (np.pi - azimuth) / (2 * np.pi) * grid.columns - 0.5
     whole = np.round(column)
@@ -371,7 +371,7 @@ def _cells(
 
 
 def _ego_at(log: DrivingLog, times_us: Float) -> Float:
-    """``T_world_vehicle`` [N, 4, 4]; outside the log the vehicle goes straight on."""
+    """``T_world_vehicle`` [N, 4, 4], extrapolated linearly outside the log."""
     known = log.ego.times_us
     if len(known) == 1:
         return np.tile(log.ego.transform(int(known[0])), (len(times_us), 1, 1))

@@ -58,7 +58,7 @@ def test_a_straight_road_that_fits_anywhere_is_refused():
         align(graph, poses)
 
 
-def test_nothing_driven_is_refused():
+def test_alignment_without_a_drive_is_refused():
     with pytest.raises(MapError, match="no vehicle drove"):
         align(GRAPH, np.zeros((0, 3)))
 

@@ -164,7 +164,7 @@ def test_signals_rule_the_lanes_that_they_face_and_find_their_stop_line(tmp_path
         ),
     ],
 )
-def test_what_is_no_map_is_refused_by_name(tmp_path, text, reason):
+def test_invalid_maps_are_refused_by_name(tmp_path, text, reason):
     path = tmp_path / "bad.xodr"
     path.write_text(text)
     with pytest.raises(MapError, match=reason) as caught:

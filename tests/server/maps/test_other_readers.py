@@ -199,7 +199,7 @@ def limited_by(sign, key="9"):
     )
 
 
-def test_what_an_editor_marked_as_deleted_is_no_lane(from_map):
+def test_elements_marked_as_deleted_are_ignored(from_map):
     lanes, figures, _ = from_map(lanelet(1) + lanelet(2, action=' action="delete"'))
     assert [lane["lane_id"] for lane in lanes] == ["l1"]
     assert figures["notes"] == []
@@ -213,7 +213,7 @@ def test_a_limit_given_by_a_sign_is_read(from_map, sign):
 
 
 @pytest.mark.parametrize("sign", ["de274-56", "usR2-1", "1.2.3"])
-def test_a_limit_that_cannot_be_read_is_noted(from_map, sign):
+def test_an_unreadable_speed_limit_is_noted(from_map, sign):
     lanes, figures, told = from_map(limited_by(sign))
     assert lanes[0]["speed_limit"] is None
     [note] = figures["notes"]
@@ -222,7 +222,7 @@ def test_a_limit_that_cannot_be_read_is_noted(from_map, sign):
 
 
 @pytest.mark.parametrize("side", ["left", "right"])
-def test_lanelets_that_lack_a_rim_are_noted(from_map, side):
+def test_lanelets_without_a_boundary_are_noted(from_map, side):
     lanes, figures, told = from_map(lanelet(1) + lanelet(2, [side]) + lanelet(3, [side]))
     assert [lane["lane_id"] for lane in lanes] == ["l1"]
     [note] = figures["notes"]

@@ -1,4 +1,4 @@
-"""Every test of the solver has one thread of torch."""
+"""All solver tests use a single torch thread."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Solvers on the CUDA backend whose kernels run on the CPU, see ``kernel_twin``."""
+"""CUDA-backend solvers whose kernels run on the CPU, see ``kernel_twin``."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .kernel_twin import TwinLauncher
 
 
 def on_twin(make: Callable[[], Solver], launcher: Callable[[str], Any] = TwinLauncher) -> Solver:
-    """What ``make`` gives, when every backend that it asks for is CUDA."""
+    """What ``make`` returns when every backend it asks for is CUDA."""
     backend = CudaSolverBackend(launcher)
     with mock.patch.object(solver, "select_backend", return_value=backend):
         return make()

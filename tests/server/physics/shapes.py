@@ -23,7 +23,7 @@ def box_surface(size) -> TriangleSurface:
 
 
 def half_pipe(radius: float, length: float, *, sides: int = 48, thickness=0.02) -> TriangleSurface:
-    """A sheet, open at the top, about the y axis through the origin; its inside has the radius."""
+    """A sheet around the y axis, open at the top, with the given inner radius."""
     angle = np.linspace(-np.pi, 0, sides + 1)
     outer = radius + thickness / 2
     ring = np.stack([outer * np.cos(angle), 0 * angle, outer * np.sin(angle)], axis=1)

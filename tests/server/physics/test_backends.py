@@ -1,4 +1,4 @@
-"""The contract of every backend: the same motion, to the precision it works in."""
+"""The contract of every backend: the same motion, to its working precision."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ MATERIALS = [
     Snow(density=200),
     Structure(young=2e5, density=200, critical_compression=0.01),
 ]
-# Sand comes apart and closes again at a kink of its constitutive law, where rounding decides.
+# Sand separates and closes again at a kink of its constitutive law, where rounding decides.
 AGREEMENT = {"Sand": 1e-3}
 STATE = ("positions", "velocities", "gradients", "F_elastic", "F_total", "history")
 
 
 def crash(material, backend, precision="double", **options):
-    """One cube on the ground, another one thrown at it, in fixed steps."""
+    """One cube on the ground and another thrown at it, in fixed steps."""
     bodies = [
         cube("low", (0.03, 0, 0.16), edge=0.2, material=material, velocity=(1, 0, -2)),
         cube(
@@ -59,7 +59,7 @@ def crash(material, backend, precision="double", **options):
 
 
 @pytest.mark.parametrize("material", MATERIALS, ids=lambda m: type(m).__name__)
-def test_cpu_follows_the_reference_through_a_crash(material):
+def test_cpu_matches_the_reference_through_a_crash(material):
     runs = [crash(material, backend) for backend in ("reference", "cpu")]
     for run in runs:
         run.step(0.03)
@@ -76,7 +76,7 @@ def test_cpu_follows_the_reference_through_a_crash(material):
 
 
 def mixed(backend, precision):
-    """A cube thrown at the ground whose particles are of four laws in turns, as in a car."""
+    """A cube thrown at the ground whose particles alternate between four laws, as in a car."""
     kinds = (Snow(density=200), MATERIALS[-1], NeoHookean(young=2e5), MATERIALS[0])
     body = cube(
         position=(0.02, 0.01, 0.18),
@@ -88,7 +88,7 @@ def mixed(backend, precision):
     return solve([body], [ground()], backend=backend, precision=precision, dt_max=2.5e-4)
 
 
-def test_laws_side_by_side_follow_the_reference():
+def test_mixed_laws_match_the_reference():
     runs = [mixed(backend, "double") for backend in ("reference", "cpu")]
     for run in runs:
         run.step(0.0175)
@@ -99,7 +99,7 @@ def test_laws_side_by_side_follow_the_reference():
         assert np.abs(getattr(found, name) - getattr(expected, name)).max() < 1e-7 * scale, name
 
 
-def test_what_yields_in_single_precision_stays_near_double():
+def test_yielding_in_single_precision_stays_close_to_double():
     runs = [mixed("cpu", precision) for precision in ("double", "single")]
     for run in runs:
         run.step(0.03)
@@ -108,7 +108,7 @@ def test_what_yields_in_single_precision_stays_near_double():
     assert np.abs(single.history - double.history).max() < 1e-2
 
 
-def test_many_substeps_at_once_are_the_same_substeps():
+def test_batched_substeps_equal_single_substeps():
     runs = [crash(SOFT, "cpu", "single") for _ in range(2)]
     dt = runs[0].time_step()
     for steps in (7, 5, 1, 11):
@@ -120,7 +120,7 @@ def test_many_substeps_at_once_are_the_same_substeps():
         np.testing.assert_array_equal(getattr(together, name), getattr(one_by_one, name))
 
 
-def test_single_precision_stays_near_double():
+def test_single_precision_stays_close_to_double():
     runs = [crash(SOFT, "cpu", precision) for precision in ("double", "single")]
     for run in runs:
         run.step(0.03)
@@ -146,7 +146,7 @@ def test_single_precision_stays_near_double():
     ],
     ids=lambda c: c.name,
 )
-def test_cpu_touches_colliders_as_the_reference_does(collider):
+def test_cpu_collider_contact_matches_the_reference(collider):
     runs = [
         solve(
             [cube(position=(0.02, 0.01, 0.18), edge=0.2, velocity=(0.5, 0, -3))],
@@ -179,7 +179,7 @@ print(numba.get_num_threads(), hashlib.sha256(state).hexdigest())
 """
 
 
-def test_the_number_of_threads_does_not_change_a_bit():
+def test_results_do_not_depend_on_the_number_of_threads():
     root = Path(__file__).parents[3]
     runs = [
         subprocess.Popen(
@@ -196,7 +196,7 @@ def test_the_number_of_threads_does_not_change_a_bit():
 
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
-def test_a_restored_snapshot_goes_on_to_the_same_bits(backend):
+def test_a_restored_snapshot_continues_identically(backend):
     run = crash(SOFT, backend)
     run.step(0.01)
     kept = run.snapshot()
@@ -208,12 +208,12 @@ def test_a_restored_snapshot_goes_on_to_the_same_bits(backend):
         assert getattr(run.particles(), name).tobytes() == getattr(first, name).tobytes()
 
 
-def test_unknown_backends_are_named():
+def test_unknown_backends_are_reported_by_name():
     with pytest.raises(SolverError, match="allowed are 'auto'"):
         select_backend("gpu")
 
 
-def test_bodies_travel_through_blocks_as_in_the_reference():
+def test_bodies_crossing_blocks_match_the_reference():
     runs = [
         solve(
             [cube(edge=0.2, velocity=(30, -20, 10), angular_velocity=(0, 30, 60))],

@@ -1,4 +1,4 @@
-"""Known parameters are found again from what they did."""
+"""Known parameters are recovered from the motion they caused."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SOFT = FixedCorotated(young=2e5, poisson=0.3, viscosity=100)
 
 
 def pressed(material):
-    """A block that slides, sunk into ground that holds it, while it swings and creeps."""
+    """A sliding block, sunk into the ground that holds it, while it swings and creeps."""
     body = cube(
         position=(0.013, 0.027, 0.06),
         edge=0.15,
@@ -54,7 +54,7 @@ def test_known_parameters_are_recovered_from_a_trajectory(names):
 
 
 @pytest.mark.slow
-def test_yield_stress_is_recovered_too():
+def test_yield_stress_is_recovered():
     metal = Metal(young=2e5, poisson=0.3, yield_stress=4e3, hardening=1e4, viscosity=50)
     names = list(TRUE)
     found = calibrate(
@@ -65,7 +65,7 @@ def test_yield_stress_is_recovered_too():
 
 
 @pytest.mark.slow
-def test_what_was_observed_on_finer_cells_is_found_within_the_uncertainty():
+def test_parameters_observed_on_finer_cells_are_found_within_uncertainty():
     names = ["stiffness", "speed"]
     body = pressed(SOFT).bodies[0]
     fine = solve([body], [ground(separable=False)], backend="reference", dx=0.075)
@@ -77,16 +77,16 @@ def test_what_was_observed_on_finer_cells_is_found_within_the_uncertainty():
     assert found.discretisation["stiffness"] > 0.01
 
 
-def test_residuals_never_rise_and_blown_up_steps_are_taken_back():
+def test_residuals_never_rise_and_diverging_steps_are_reverted():
     start = observed(pressed(SOFT), ["speed"])
-    # A hundred times too stiff is far beyond what this substep can take.
+    # A hundred times too stiff is far beyond what this substep can handle.
     hard = pressed(FixedCorotated(young=8e5, poisson=0.3, viscosity=100))
     found = calibrate(hard, start, parameters=["stiffness", "speed"], dt=DT, every=EVERY, steps=3)
     assert np.isfinite(found.residual).all()
     assert (np.diff(found.residual) < 0).all()
 
 
-def test_a_parameter_that_changes_nothing_stays_and_is_said_to_be_unknown():
+def test_a_parameter_without_effect_stays_and_is_reported_unknown():
     solver = pressed(SOFT)
     names = ["yield_stress", "speed"]
     target = observed(pressed(SOFT), ["speed"])
@@ -114,6 +114,6 @@ def test_dual_numbers_agree_with_central_differences():
         (["speed"], np.full((1, 27, 3), np.nan), "must be finite"),
     ],
 )
-def test_what_cannot_be_fitted_is_named(parameters, seen, message):
+def test_parameters_that_cannot_be_fitted_are_named(parameters, seen, message):
     with pytest.raises(SolverError, match=message):
         calibrate(pressed(SOFT), seen, parameters=parameters, dt=DT, every=1)

@@ -1,4 +1,4 @@
-"""Rows of particles become columns of lanes and come back."""
+"""Particle rows become lane columns and are restored."""
 
 import numba
 import numpy as np
@@ -30,7 +30,7 @@ def six_back(scratch, rows):
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_columns_hold_the_rows(dtype):
+def test_columns_contain_the_rows(dtype):
     rows = np.arange((BATCH + 9) * 9, dtype=dtype).reshape(-1, 9)
     scratch = np.full(20 * BATCH, -1, dtype)
     there(rows, scratch)
@@ -42,7 +42,7 @@ def test_columns_hold_the_rows(dtype):
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize(("width", "back"), [(9, nine_back), (6, six_back)])
-def test_rows_come_back_and_their_neighbours_stay(dtype, width, back):
+def test_rows_round_trip_and_their_neighbours_are_untouched(dtype, width, back):
     rows = np.full((BATCH + 9, width), -1, dtype)
     scratch = np.arange(20 * BATCH, dtype=dtype)
     back(scratch, rows)

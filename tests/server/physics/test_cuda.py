@@ -1,7 +1,7 @@
-"""The CUDA backend against the CPU's: its kernels run on the CPU, line for line.
+"""The CUDA backend compared with the CPU backend: its kernels run on the CPU, line for line.
 
-Both find the same to rounding: they add up in the same order, particle after particle, and take
-laws and contact from one source.
+Both agree up to rounding: they sum in the same order, particle after particle, and take
+laws and contact from the same source.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ TOLERANCE = 1e-8
 
 
 def both(make: Callable[[], Solver], seconds: float) -> tuple[Solver, Solver]:
-    """The same scene on the CPU and on the device, that much later."""
+    """The same scene on the CPU and on the device, after the given time."""
     runs = make(), on_twin(make)
     for run in runs:
         run.step(seconds)
@@ -71,7 +71,7 @@ def assert_alike(runs: tuple[Solver, Solver], tolerance: float = TOLERANCE) -> N
 
 
 @pytest.mark.parametrize("material", MATERIALS, ids=lambda m: type(m).__name__)
-def test_materials_crash_as_on_the_cpu(material):
+def test_material_crashes_match_the_cpu(material):
     runs = both(lambda: crash(material, "cpu"), 0.008)
     assert_alike(runs)
     assert len(runs[0].contacts) == 2
@@ -94,7 +94,7 @@ COLLIDERS = [
 
 
 @pytest.mark.parametrize("collider", COLLIDERS, ids=lambda c: c.name)
-def test_colliders_are_touched_as_on_the_cpu(collider):
+def test_collider_contact_matches_the_cpu(collider):
     def thrown() -> Solver:
         body = cube(position=(0.02, 0.01, 0.13), edge=0.2, velocity=(0.5, 0, -6))
         return solve([body], [collider], precision="double", dt_max=5e-4)
@@ -104,13 +104,13 @@ def test_colliders_are_touched_as_on_the_cpu(collider):
     assert [c.other for c in runs[1].contacts] == [collider.name]
 
 
-def test_laws_side_by_side_are_those_of_the_cpu():
+def test_mixed_laws_match_the_cpu():
     runs = both(lambda: mixed("cpu", "double"), 0.01)
     assert np.abs(runs[0].particles().history).max() > 1e-4
     assert_alike(runs)
 
 
-def test_single_precision_stays_near_the_cpu():
+def test_single_precision_stays_close_to_the_cpu():
     runs = both(lambda: mixed("cpu", "single"), 0.01)
     expected, found = (run.particles() for run in runs)
     assert np.abs(found.positions - expected.positions).max() < 1e-6
@@ -123,7 +123,7 @@ def travelling(precision: str = "double") -> Solver:
     return solve([body], precision=precision, gravity=(0, 0, 0), dt_max=5e-4)
 
 
-def test_bodies_travel_through_blocks_and_the_host_sorts_before_they_leave_theirs():
+def test_the_host_sorts_before_moving_bodies_leave_their_blocks():
     launchers: list[TwinLauncher] = []
 
     def launcher(precision: str) -> TwinLauncher:
@@ -136,17 +136,17 @@ def test_bodies_travel_through_blocks_and_the_host_sorts_before_they_leave_their
     assert_alike(runs)
     asked = launchers[0].launches
     assert asked["find_keys"] > 3
-    # One to begin with, and one for each check: nothing was found halted.
+    # One at the start and one for each check: nothing was found halted.
     assert asked["begin_run"] == 1 + -(-report.substeps // 16)
 
 
-def test_a_particle_that_leaves_its_tile_stops_the_device_until_all_are_sorted(monkeypatch):
+def test_a_particle_leaving_its_tile_halts_the_device_until_sorted(monkeypatch):
     monkeypatch.setattr(cuda_backend, "CAUTION", 0.0)
     assert_alike(both(travelling, 0.01))
 
 
 def many(precision: str = "single") -> Solver:
-    """Two bodies of three laws on a thin plate that moves, and on the ground."""
+    """Two bodies with three laws on a moving thin plate and on the ground."""
     kinds = (Snow(density=200), Structure(young=2e5, density=200), SOFT)
     bodies = [
         cube(
@@ -162,7 +162,7 @@ def many(precision: str = "single") -> Solver:
     return solve(bodies, [ground(), plate], precision=precision, dt_max=2.5e-4)
 
 
-def test_the_order_of_blocks_and_threads_does_not_change_a_bit():
+def test_results_do_not_depend_on_block_and_thread_order():
     states = []
     for backwards in (False, True):
         run = on_twin(many, functools.partial(TwinLauncher, backwards=backwards))
@@ -174,11 +174,11 @@ def test_the_order_of_blocks_and_threads_does_not_change_a_bit():
         assert one.tobytes() == other.tobytes()
 
 
-def test_bodies_plates_and_laws_together_are_those_of_the_cpu():
+def test_bodies_plates_and_laws_together_match_the_cpu():
     assert_alike(both(lambda: many("double"), 0.008))
 
 
-def test_a_restored_snapshot_goes_on_to_the_same_bits():
+def test_a_restored_snapshot_continues_identically():
     run = on_twin(many)
     run.step(0.004)
     kept = run.snapshot()
@@ -193,7 +193,7 @@ def test_a_restored_snapshot_goes_on_to_the_same_bits():
         np.testing.assert_allclose(one.impulse, other.impulse, rtol=1e-12)
 
 
-def test_lists_that_outgrow_their_memory_are_made_again():
+def test_lists_that_outgrow_their_memory_are_reallocated():
     def scattered() -> Solver:
         bodies = [cube(f"{k}", (k * 0.31, 0.2 * k, 0.06), edge=0.1) for k in range(40)]
         return solve(bodies, [ground()], precision="double", dt_max=2.5e-4)
@@ -204,7 +204,7 @@ def test_lists_that_outgrow_their_memory_are_made_again():
     assert_alike(runs)
 
 
-def test_what_leaves_the_numbers_is_found_and_taken_back():
+def test_non_finite_states_are_detected_and_reverted():
     run = on_twin(many)
     simulation = run.simulation
     kept = simulation.save()
@@ -226,7 +226,7 @@ def test_particles_beyond_the_grid_are_refused():
         on_twin(far)
 
 
-def test_without_a_device_the_reason_is_given():
+def test_a_missing_device_is_reported_with_the_reason():
     with pytest.raises(SolverError, match=r"'cuda' is not usable here: .*NVIDIA GPU.*take 'cpu'"):
         CudaSolverBackend()
 
@@ -251,10 +251,10 @@ def test_cases_with_known_answers_hold(case):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("material", MATERIALS, ids=lambda m: type(m).__name__)
-def test_long_crashes_stay_near_those_of_the_cpu(material):
+def test_long_crashes_stay_close_to_the_cpu(material):
     runs = both(lambda: crash(material, "cpu"), 0.03)
     expected, found = (run.particles() for run in runs)
-    # Sand comes apart and closes again at a kink of its law, where rounding decides.
+    # Sand separates and closes again at a kink of its law, where rounding decides.
     bound = 1e-3 if type(material).__name__ == "Sand" else 1e-6
     assert np.abs(found.positions - expected.positions).max() < bound
     assert len(runs[1].contacts) == len(runs[0].contacts) >= 3

@@ -1,4 +1,4 @@
-"""NVRTC compiles the solver for GPUs that are not there, and nothing spills."""
+"""NVRTC compiles the solver for GPUs that are not present, without register spills."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ needs_nvrtc = pytest.mark.skipif(bool(MISSING), reason=MISSING)
         for case in itertools.product(PRECISIONS, ARCHITECTURES)
     ],
 )
-def test_every_kernel_compiles_and_none_spills(precision: str, architecture: str) -> None:
+def test_every_kernel_compiles_without_spills(precision: str, architecture: str) -> None:
     code, usages = launcher.compile_kernels(precision, architecture)
     assert code[:4] == b"\x7fELF"
     assert set(usages) == set(KERNELS)
     assert {name: usage.spilled for name, usage in usages.items() if usage.spilled} == {}
     assert all(usage.stack == 0 for usage in usages.values())
-    # A block of threads at least works while another waits.
+    # At least one block of threads works while another waits.
     few = min(usage.occupancy(architecture, THREADS) for usage in usages.values())
     assert few >= 2 * THREADS / 2048
 
 
 @needs_nvrtc
-def test_what_was_compiled_is_kept_by_precision_and_architecture(
+def test_compiled_kernels_are_cached_by_precision_and_architecture(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made: list[tuple[str, str]] = []
@@ -62,9 +62,7 @@ def test_what_was_compiled_is_kept_by_precision_and_architecture(
 
 
 @needs_nvrtc
-def test_a_source_that_is_wrong_is_refused_in_the_words_of_the_compiler(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_compiler_errors_are_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TORCH_EXTENSIONS_DIR", str(tmp_path))
     monkeypatch.setattr(launcher, "solver_source", lambda precision: "void f() { nonsense; }")
     with pytest.raises(SolverError, match="nonsense"):
@@ -75,7 +73,7 @@ FACTOR = 2.5
 
 
 def shortened(v: Any, length: Any) -> Any:
-    """What the translator is asked for below."""
+    """A function for the translator tests below."""
     total = 0
     for axis in range(3):
         total += v[axis] * v[axis]
@@ -88,16 +86,16 @@ def spread(values: Any) -> Any:
     return [value * 2 for value in values]
 
 
-def test_a_function_becomes_cpp_with_the_types_that_it_needs() -> None:
+def test_a_function_is_translated_to_cpp_with_the_right_types() -> None:
     made = source.Translator("double", "some_")
     name, kind = made.add(shortened, (("real",) * 3, "real"))
     assert (name, kind) == ("shortened", (("real",) * 3, "real"))
-    assert "double total{};" in made.text  # Begun as a whole number, it does not stay one.
+    assert "double total{};" in made.text  # It starts as an integer but does not stay one.
     assert "(v[1] / double(2.5))" in made.text
     assert "root(v[2])" in made.text
 
 
-def test_more_than_kernels_know_is_refused_with_its_place() -> None:
+def test_unsupported_syntax_is_refused_with_its_location() -> None:
     made = source.Translator("double", "some_")
     with pytest.raises(source.Untranslatable, match=r"spread, line \d+: .*\[value \* 2 for"):
         made.add(spread, (("real",) * 3,))

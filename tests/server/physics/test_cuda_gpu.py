@@ -1,4 +1,4 @@
-"""The solver on a GPU against the CPU: the only tests that say it is right there."""
+"""The solver on a GPU compared with the CPU: the only tests of its correctness there."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ def states(run: Solver) -> dict[str, Any]:
 
 @pytest.mark.parametrize("precision", ["single", "double"])
 @pytest.mark.parametrize("material", MATERIALS, ids=lambda m: type(m).__name__)
-def test_crashes_are_those_of_the_cpu(material, precision):
+def test_crashes_match_the_cpu(material, precision):
     runs = [crash(material, backend, precision) for backend in ("cpu", "cuda")]
     for run in runs:
         run.step(0.008)
     expected, found = (states(run) for run in runs)
     bound = 1e-8 if precision == "double" else 1e-3
     if precision == "single" and isinstance(material, Sand):
-        bound = 1e-2  # It comes apart at a kink of its law, where rounding decides.
+        bound = 1e-2  # It separates at a kink of its law, where rounding decides.
     for name in STATE:
         scale = 1 + np.abs(expected[name]).max()
         assert np.abs(found[name] - expected[name]).max() < bound * scale, name
@@ -43,7 +43,7 @@ def test_crashes_are_those_of_the_cpu(material, precision):
         np.testing.assert_allclose(b.impulse, a.impulse, atol=1e3 * bound)
 
 
-def test_the_same_run_gives_the_same_bits():
+def test_runs_are_reproducible():
     ends = []
     for _ in range(3):
         run = mixed("cuda", "single")
@@ -52,7 +52,7 @@ def test_the_same_run_gives_the_same_bits():
     assert len(set(ends)) == 1
 
 
-def test_a_restored_snapshot_goes_on_to_the_same_bits():
+def test_a_restored_snapshot_continues_identically():
     run = mixed("cuda", "single")
     run.step(0.01)
     kept = run.snapshot()
@@ -64,7 +64,7 @@ def test_a_restored_snapshot_goes_on_to_the_same_bits():
     assert ends[0] == ends[1]
 
 
-def test_many_blocks_on_a_moving_box_follow_the_cpu():
+def test_many_blocks_on_a_moving_box_match_the_cpu():
     block = lattice([1.5] * 3, spacing=0.05, density=200).moved(at(0.01, 0.02, 1.0))
     box = Box(name="box", T_world_box=at(0, 0, 0), size=(4, 4, 0.4), velocity=(1, 0, 0.5))
     runs = []

@@ -1,4 +1,4 @@
-"""How the solver's launches reach a GPU: a stand-in for cuda-core takes down what it is given."""
+"""How the solver's launches reach a GPU: a fake cuda-core records what it is given."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LAUNCHES = (Launch("collect_fields", 12, 3), Launch("advance_blocks", 5, 1 << 16
 
 
 class Builder:
-    """Takes down what is captured, as a stream that nothing runs on."""
+    """Records what is captured, like a stream that runs nothing."""
 
     def __init__(self, taken: list[Any]) -> None:
         self._taken = taken
@@ -38,7 +38,7 @@ class Builder:
 
 @pytest.fixture
 def taken(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Any]]:
-    """What cuda-core was asked for, on a machine with one GPU."""
+    """The calls that cuda-core received, on a machine with one GPU."""
     taken: list[Any] = []
     device = SimpleNamespace(set_current=lambda: None, create_graph_builder=lambda: Builder(taken))
     code = SimpleNamespace(get_kernel=lambda name: f"kernel {name}")
@@ -62,7 +62,7 @@ def taken(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Any]]:
     launcher_module._loaded_kernels.cache_clear()
 
 
-def test_a_sequence_is_launched_then_captured_then_launched_as_one(taken: list[Any]) -> None:
+def test_a_sequence_is_launched_then_captured_then_launched_as_a_graph(taken: list[Any]) -> None:
     launcher = CudaLauncher("single")
     for _ in range(3):
         launcher.run(LAUNCHES, 0x7000)
@@ -71,7 +71,7 @@ def test_a_sequence_is_launched_then_captured_then_launched_as_one(taken: list[A
         ("default stream", (12, 128), "kernel collect_fields", 0x7000, np.uint32(3)),
         ("default stream", (5, 128), "kernel advance_blocks", 0x7000, np.uint32(1 << 16)),
     ]
-    # A kernel takes an address of 64 bits and a number of 32.
+    # A kernel takes a 64-bit address and a 32-bit number.
     assert type(first[0][3]) is int
     assert type(first[0][4]) is np.uint32
     assert isinstance(captured[0][0], Builder)
@@ -80,14 +80,14 @@ def test_a_sequence_is_launched_then_captured_then_launched_as_one(taken: list[A
     assert again == [("graph", "default stream")]
 
 
-def test_few_graphs_are_kept(taken: list[Any]) -> None:
+def test_only_a_few_graphs_are_kept(taken: list[Any]) -> None:
     launcher = CudaLauncher("single")
     for number in range(3 * GRAPHS):
         launcher.run((Launch("begin_run", 1, number),), 0x7000)
     assert len(launcher._graphs) == GRAPHS
 
 
-def test_a_launch_that_fails_is_known_as_the_loss_of_the_device(
+def test_a_failed_launch_counts_as_a_lost_device(
     taken: list[Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     launcher = CudaLauncher("single")

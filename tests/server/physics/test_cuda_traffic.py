@@ -1,4 +1,4 @@
-"""Bytes of a substep against what no order of work can save; and what a substep does not read."""
+"""Bytes moved by a substep against the lower bound; and what a substep does not read."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from .scenes import cube, solve
 
 
 def block_of_a_million(cells: int) -> dict[str, int]:
-    """Layout of a cube of a million particles, ``cells`` of them to a cell of the grid."""
+    """Layout of a cube of a million particles, ``cells`` of them per grid cell."""
     along = (np.arange(100) + 0.37) / cells ** (1 / 3)
     positions = np.stack(np.meshgrid(along, along, along, indexing="ij"), axis=-1).reshape(-1, 3)
     blocks = np.floor((positions - 0.5) / 4).astype(np.int64)
@@ -37,13 +37,13 @@ def block_of_a_million(cells: int) -> dict[str, int]:
 
 @pytest.mark.parametrize("plastic", [False, True])
 @pytest.mark.parametrize("cells", [8, 14])
-def test_a_substep_moves_at_most_three_times_the_floor(cells: int, plastic: bool) -> None:
+def test_a_substep_moves_less_than_2_5_times_the_lower_bound(cells: int, plastic: bool) -> None:
     traffic = substep_traffic(**block_of_a_million(cells), plastic=plastic)
     assert traffic.moved < 2.5 * traffic.floor
 
 
 @pytest.mark.skipif(COMPILER is None, reason=NEEDS_COMPILER)
-def test_what_a_substep_finds_anew_it_does_not_read() -> None:
+def test_a_substep_does_not_read_what_it_recomputes() -> None:
     ends = []
     for spoilt in (False, True):
         run = on_twin(lambda: solve([cube(edge=0.1, velocity=(1, 0, 0))], precision="single"))

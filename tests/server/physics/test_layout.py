@@ -1,4 +1,4 @@
-"""What backends on blocks find near: the same distances as kernels have."""
+"""What block-based backends consider near: the same distances as in the kernels."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ TURNED = np.array([[0.6, -0.8, 0, 1.0], [0.8, 0.6, 0, -0.5], [0, 0, 1, 0.2], [0,
     ],
     ids=lambda c: c.name,
 )
-def test_distances_of_many_points_are_those_of_each(collider):
+def test_batched_distances_equal_single_ones(collider):
     flat = HeightField(name="flat", heights=np.zeros((3, 3)))
     rows, heights = pack_colliders([flat, collider], 0.1)
     points = np.random.default_rng(1).uniform(-2, 2, (60, 3))
@@ -48,7 +48,7 @@ def test_distances_of_many_points_are_those_of_each(collider):
     ],
     ids=lambda c: c.name,
 )
-def test_solids_are_never_nearer_than_they_are_looked_for(solid):
+def test_solids_are_never_nearer_than_the_search_distance(solid):
     rows, data = pack_colliders([solid], 0.1)
     points = np.random.default_rng(1).uniform(-2, 2, (60, 3))
     each = np.array([collider_distance(rows[0], data, *p)[0] for p in points])

@@ -1,4 +1,4 @@
-"""Materials: what they refuse, and what they do with a squeeze."""
+"""Materials: what they refuse, and how they respond to compression."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_impossible_parameters_are_refused_by_name(make, words):
         make()
 
 
-def test_moduli_follow_from_young_and_poisson():
+def test_moduli_follow_from_youngs_modulus_and_poissons_ratio():
     soft = FixedCorotated(young=2e6, poisson=0.4, density=200)
     assert soft.shear_modulus == pytest.approx(2e6 / 2.8)
     assert soft.lame_lambda == pytest.approx(2e6 * 0.4 / (1.4 * 0.2))
@@ -55,7 +55,7 @@ def test_moduli_follow_from_young_and_poisson():
 
 
 def stressed(material, F):
-    """A body held in one deformation, after one tiny step."""
+    """A body held at one deformation, after one tiny step."""
     particles = box_particles([0.4] * 3, spacing=0.05, density=200)
     held = np.tile(np.asarray(F, float), (len(particles), 1, 1))
     body = Body(name="held", particles=particles, material=material, deformation=held)
@@ -65,7 +65,7 @@ def stressed(material, F):
     return solver.particles().F_elastic[inner].mean(0), solver
 
 
-def test_metal_flows_back_to_its_yield_surface_and_keeps_the_dent():
+def test_metal_returns_to_its_yield_surface_and_keeps_the_dent():
     metal = Metal(young=1e6, poisson=0.3, yield_stress=1e4)
     shear = np.array([[1, 0.2, 0], [0, 1, 0], [0, 0, 1]])
     F, solver = stressed(metal, shear)
@@ -78,7 +78,7 @@ def test_metal_flows_back_to_its_yield_surface_and_keeps_the_dent():
     np.testing.assert_allclose(total.mean(0), shear, atol=1e-6)
 
 
-def test_hardening_raises_the_yield_stress_as_it_flows():
+def test_hardening_raises_the_yield_stress_during_flow():
     shear = np.array([[1, 0.2, 0], [0, 1, 0], [0, 0, 1]])
     soft = Metal(young=1e6, yield_stress=1e4)
     hard = Metal(young=1e6, yield_stress=1e4, hardening=2e5)
@@ -95,19 +95,19 @@ def test_foam_needs_time_to_flow():
     assert strains[1] < 0.02
 
 
-def test_sand_carries_no_tension_but_pressure():
+def test_sand_carries_pressure_but_no_tension():
     pulled = stressed(Sand(), np.eye(3) * 1.01)[1].measure.elastic[0]
     pressed = stressed(Sand(), np.eye(3) * 0.99)[1].measure.elastic[0]
     assert abs(pulled) < 1e-9
     assert pressed > 1
 
 
-def test_snow_carries_stress_and_packs_harder():
+def test_snow_carries_stress_and_hardens_when_packed():
     lightly = stressed(Snow(), np.eye(3) * 0.99)[1].measure.elastic[0]
     packed = stressed(Snow(), np.eye(3) * 0.9)
     assert lightly > 1
     assert packed[1].particles().history.max() < -0.1
-    # Beyond the critical compression strain stays, so only hardening can raise the energy.
+    # Beyond critical compression the strain is fixed, so only hardening can raise the energy.
     edge = stressed(Snow(), np.eye(3) * 0.975)[1].measure.elastic[0]
     assert packed[1].measure.elastic[0] > 1.5 * edge
 
@@ -117,7 +117,7 @@ def test_snow_carries_stress_and_packs_harder():
     [FixedCorotated(young=1e5), NeoHookean(young=1e5), NearRigid()],
     ids=lambda m: type(m).__name__,
 )
-def test_elastic_bodies_have_one_deformation(material):
+def test_elastic_bodies_have_a_single_deformation(material):
     run = solve([cube(material=material, angular_velocity=(0, 0, 20))], backend="cpu")
     run.step(0.002)
     state = run.state("cube")

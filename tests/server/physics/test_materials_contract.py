@@ -1,4 +1,4 @@
-"""The contract of every material: a record on a known law, the same on every backend."""
+"""The contract of every material: a record with a known law, the same on every backend."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ SHEARED = np.array([[1.15, 0.3, 0.0], [0.0, 0.85, 0.0], [0.0, 0.0, 1.0]])
 
 @dataclass(frozen=True, kw_only=True)
 class Clay(Material):
-    """A newcomer: flows at a shear strength, without hardening."""
+    """A new material: flows at a shear strength, without hardening."""
 
     constitutive_law: ClassVar[ConstitutiveLaw] = VON_MISES
 
@@ -53,7 +53,7 @@ def material(request, monkeypatch) -> Material:
 
 
 def thrown(material: Material, backend: str, deformation=None):
-    """A small cube on its way into the ground, in a number of stable substeps."""
+    """A small cube hitting the ground, in a number of stable substeps."""
     particles = box_particles([0.2] * 3, spacing=0.05, density=material.density)
     F = None if deformation is None else np.tile(deformation, (len(particles), 1, 1))
     body = Body(
@@ -66,7 +66,7 @@ def thrown(material: Material, backend: str, deformation=None):
     return solve([body], [Plane(name="ground")], backend=backend, precision="double")
 
 
-def test_its_row_says_law_and_plasticity(material):
+def test_a_materials_row_holds_law_and_plasticity(material):
     row = material.row()
     assert row.shape == (MATERIAL_ROW,)
     assert np.isfinite(row).all()
@@ -74,11 +74,11 @@ def test_its_row_says_law_and_plasticity(material):
     assert bool(row[PLASTIC]) == material.plastic == material.constitutive_law.plastic
 
 
-def test_at_rest_it_stores_nothing(material):
+def test_a_material_at_rest_stores_no_energy(material):
     assert thrown(material, "cpu").measure.elastic[0] == 0.0
 
 
-def test_backends_agree_on_it(material):
+def test_backends_agree_on_every_material(material):
     runs = [thrown(material, backend) for backend in ("reference", "cpu")]
     duration = 25 * runs[0].time_step()
     for run in runs:
@@ -90,14 +90,14 @@ def test_backends_agree_on_it(material):
         assert error < 1e-6 * scale, name
 
 
-def test_it_gains_no_energy(material):
+def test_a_material_gains_no_energy(material):
     run = thrown(material, "cpu")
     start = run.energies().total
     run.step(100 * run.time_step())
     assert run.energies().total <= start * (1 + 1e-3)
 
 
-def test_deformations_part_ways_where_it_is_plastic_and_only_there(material):
+def test_only_plastic_materials_have_separate_deformations(material):
     run = thrown(material, "cpu", SHEARED)
     run.step(run.time_step())
     state = run.particles()
@@ -105,18 +105,18 @@ def test_deformations_part_ways_where_it_is_plastic_and_only_there(material):
     assert apart > 1e-3 if material.plastic else apart == 0.0
 
 
-def test_every_name_of_an_operation_is_a_material():
+def test_every_material_name_in_operations_exists():
     assert set(get_args(MaterialName)) == set(MATERIALS)
 
 
-def test_names_are_given_once_and_unknown_ones_are_refused():
+def test_duplicate_and_unknown_names_are_refused():
     with pytest.raises(MaterialError, match="'metal' is there already"):
         register_material("metal")(Clay)
     with pytest.raises(MaterialError, match="unknown material 'granite'; allowed are jelly"):
         named_material("granite")
 
 
-def test_a_material_on_a_law_that_kernels_do_not_know_is_refused():
+def test_a_material_with_an_unknown_law_is_refused():
     @dataclass(frozen=True, kw_only=True)
     class Granite(Material):
         constitutive_law: ClassVar[ConstitutiveLaw] = ConstitutiveLaw("brittle", 17, plastic=False)
@@ -130,7 +130,7 @@ def test_a_material_without_a_law_is_refused():
         Material(young=1e6)
 
 
-def test_a_material_that_gives_its_law_too_few_parameters_is_refused():
+def test_a_material_with_too_few_law_parameters_is_refused():
     class Short(Clay):
         def law_parameters(self):
             return (1.0,)

@@ -1,4 +1,4 @@
-"""What kernels ask of 3x3 matrices, against NumPy."""
+"""The kernels' 3x3 matrix functions compared with NumPy."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def symmetric():
 
 
 @pytest.mark.parametrize(("bound", "sign"), [(0.95, 1.0), (1.06, -1.0)])
-def test_the_least_minor_says_whether_all_eigenvalues_are_within_a_bound(symmetric, bound, sign):
+def test_the_smallest_minor_tells_whether_eigenvalues_are_within_a_bound(symmetric, bound, sign):
     values = np.linalg.eigvalsh(symmetric)
     within = (sign * (values - bound) > 0).all(axis=1)
     assert 20 < within.sum() < 180
@@ -26,7 +26,7 @@ def test_the_least_minor_says_whether_all_eigenvalues_are_within_a_bound(symmetr
     assert found == within.tolist()
 
 
-def test_eigenvectors_are_those_of_numpy(symmetric):
+def test_eigenvectors_match_numpy(symmetric):
     for m in symmetric[:20]:
         values, vectors = eigen_symmetric(tuple(m[at] for at in SIX))
         turn = np.array(vectors).reshape(3, 3)
@@ -34,8 +34,8 @@ def test_eigenvectors_are_those_of_numpy(symmetric):
         np.testing.assert_allclose(turn.T @ turn, np.eye(3), atol=1e-6)
 
 
-def test_square_roots_of_kernels_are_instructions_that_loops_take_many_at_a_time():
-    """A call of the C library for each number would keep flow from being vector code."""
+def test_kernel_square_roots_are_vectorised():
+    """A C library call per number would keep flow from being vectorised."""
 
     @njit
     def rooted(values):

@@ -40,7 +40,7 @@ def any_pose(rng=RNG) -> np.ndarray:
 
 
 def l_shaped() -> TriangleSurface:
-    """A wall that turns a corner, 0.2 m thick: concave."""
+    """A concave, 0.2 m thick wall that turns a corner."""
     foot = np.array([[0, 0], [1, 0], [1, 0.2], [0.2, 0.2], [0.2, 1], [0, 1]])
     low, high = (np.insert(foot, 2, z, axis=1) for z in (-0.5, 0.5))
     caps = [(0, 1, 2), (0, 2, 3), (0, 3, 4), (0, 4, 5)]
@@ -68,7 +68,7 @@ def distances(solid, points):
 
 
 @pytest.mark.parametrize("name", SOLIDS)
-def test_distances_and_normals_are_those_of_the_plain_reference_and_of_each_other(name):
+def test_distances_and_normals_match_the_reference_and_each_other(name):
     solid = SOLIDS[name](any_pose())
     points = solid.pose[:3, 3] + RNG.uniform(-0.9, 0.9, (40, 3))
     d, n = distances(solid, points)
@@ -76,7 +76,7 @@ def test_distances_and_normals_are_those_of_the_plain_reference_and_of_each_othe
     np.testing.assert_allclose(d, plain.numpy(), atol=1e-12)
     np.testing.assert_allclose(n, normals.numpy(), atol=1e-9)
     assert d.min() < 0.1 < d.max()
-    # The normal is the slope of the distance, and leads to the surface.
+    # The normal is the gradient of the distance and points to the surface.
     step = 1e-6
     slope = [
         (distances(solid, points + step * e)[0] - distances(solid, points - step * e)[0]) / step / 2
@@ -86,7 +86,7 @@ def test_distances_and_normals_are_those_of_the_plain_reference_and_of_each_othe
     np.testing.assert_allclose(distances(solid, points - d[:, None] * n)[0], 0, atol=1e-9)
 
 
-def test_a_mesh_of_a_box_is_that_box():
+def test_a_box_mesh_behaves_like_the_box():
     pose, size = any_pose(), (0.4, 1.0, 0.7)
     points = pose[:3, 3] + RNG.uniform(-0.6, 0.6, (60, 3))
     mesh = TriangleMesh(name="mesh", T_world_mesh=pose, surface=box_surface(size))
@@ -96,7 +96,7 @@ def test_a_mesh_of_a_box_is_that_box():
     np.testing.assert_allclose(distances(mesh, points)[0], expected, atol=1e-12)
 
 
-def test_a_mesh_that_is_inside_out_is_turned_and_doubled_vertices_are_one():
+def test_inside_out_meshes_are_flipped_and_duplicate_vertices_merged():
     corners = box_corners((1, 1, 1))
     soup = corners[np.array(BOX_FACES)].reshape(-1, 3)
     turned = TriangleSurface(soup, np.arange(36).reshape(-1, 3)[:, ::-1])
@@ -123,9 +123,7 @@ FACES = np.array(BOX_FACES)
         ([[0, 0, 0]], np.zeros((0, 3), int), 0.1, "1 to 20000 triangles"),
     ],
 )
-def test_meshes_that_are_no_body_are_refused_with_the_reason(
-    vertices, triangles, thickness, message
-):
+def test_invalid_meshes_are_refused_with_the_reason(vertices, triangles, thickness, message):
     with pytest.raises(ColliderError, match=message):
         TriangleSurface(vertices, triangles, thickness)
 
@@ -139,7 +137,7 @@ def test_meshes_that_are_no_body_are_refused_with_the_reason(
         (lambda: Capsule(name="p", T_world_capsule=2 * np.eye(4), radius=1, length=1), "rigid"),
     ],
 )
-def test_shapes_without_extent_are_refused(make, message):
+def test_shapes_of_zero_size_are_refused(make, message):
     with pytest.raises(ColliderError, match=message):
         make()
 
@@ -154,7 +152,7 @@ POSTS = {
 
 
 def speeds_left(posts, yaw):
-    """Speed of the front against each post after 0.1 s, of cars at SPEED."""
+    """Speed of the front at each post after 0.1 s, for cars at SPEED."""
     block = box_particles((2.0, 1.0, 0.4), spacing=0.1, density=150)
     bodies, colliders = [], []
     for k, (kind, width, side) in enumerate(posts):
@@ -185,7 +183,7 @@ def speeds_left(posts, yaw):
     return np.array(left)
 
 
-def test_round_posts_and_posts_of_triangles_stop_what_meets_them():
+def test_round_and_mesh_posts_stop_cars():
     posts = [
         ("cylinder", 0.05, 0.12),
         ("capsule", 0.05, -0.29),
@@ -205,12 +203,12 @@ def test_round_posts_and_posts_of_triangles_stop_what_meets_them():
         *[("mesh", w) for w in (0.1, 0.15, 0.3)],
     ],
 )
-def test_posts_of_any_shape_stop_at_any_place_of_the_front(kind, width, yaw):
+def test_posts_of_any_shape_stop_cars_at_any_position_along_the_front(kind, width, yaw):
     posts = [(kind, width, side) for side in np.linspace(-0.37, 0.37, 10)]
     assert speeds_left(posts, yaw).max() < 0.15 * SPEED
 
 
-def test_a_sheet_of_a_fifth_of_a_cell_holds_at_any_phase_of_the_grid():
+def test_a_sheet_a_fifth_of_a_cell_thick_holds_at_any_grid_phase():
     dx, thickness = 0.1, 0.02
     block = box_particles((0.3, 0.3, 0.2), spacing=dx / 2, density=200)
     square = [[0, -1, -1], [0, 1, -1], [0, 1, 1], [0, -1, 1]]
@@ -236,7 +234,7 @@ def test_a_sheet_of_a_fifth_of_a_cell_holds_at_any_phase_of_the_grid():
 
 
 @pytest.mark.parametrize("kind", POSTS)
-def test_a_post_that_moves_at_100_metres_a_second_takes_along_what_it_meets(kind):
+def test_a_post_moving_at_100_m_s_carries_what_it_hits(kind):
     block = box_particles((0.2, 0.2, 0.2), spacing=0.05, density=200)
     post = POSTS[kind]("post", at(0.25, 0.01, 0), 0.15)
     post = replace(post, velocity=(-100, 0, 0))
@@ -252,7 +250,7 @@ def test_a_post_that_moves_at_100_metres_a_second_takes_along_what_it_meets(kind
 
 
 @pytest.mark.parametrize("kind", POSTS)
-def test_what_starts_around_a_thin_post_stays_together(kind):
+def test_a_body_starting_around_a_thin_post_stays_together(kind):
     body = cube(material=FixedCorotated(young=2e6), velocity=(1, 0, 0))
     solver = solve([body], [POSTS[kind]("post", at(0.02, 0.01, 0), 0.06)], gravity=(0, 0, 0))
     solver.step(0.01)
@@ -262,7 +260,7 @@ def test_what_starts_around_a_thin_post_stays_together(kind):
 
 
 @pytest.mark.parametrize("kind", POSTS)
-def test_the_cpu_follows_the_reference_around_a_post(kind):
+def test_the_cpu_matches_the_reference_around_a_post(kind):
     def run(backend):
         body = cube(edge=0.2, velocity=(6, 0.5, 0), angular_velocity=(0, 0, 2), friction=0.3)
         post = POSTS[kind]("post", at(0.16, 0.03, 0.01), 0.06)
@@ -281,7 +279,7 @@ def test_the_cpu_follows_the_reference_around_a_post(kind):
     assert np.linalg.norm(a.impulse) > 1
 
 
-def test_a_ball_swings_in_a_half_pipe_as_a_pendulum_does():
+def test_a_ball_in_a_half_pipe_swings_like_a_pendulum():
     radius, ball, angle = 2.0, 0.2, 0.4
     pipe = TriangleMesh(
         name="pipe", T_world_mesh=np.eye(4), surface=half_pipe(radius, 1.5, sides=32), friction=0.0
@@ -303,5 +301,5 @@ def test_a_ball_swings_in_a_half_pipe_as_a_pendulum_does():
     x, y, z = solver.states()[0].centre
     assert np.arctan2(x, -z) == pytest.approx(-angle, rel=0.12)
     assert abs(y) < 0.01
-    # It lies as deep as on any thin collider: up to half a cell.
+    # It sinks in as on any thin collider: up to half a cell.
     assert np.hypot(x, z) == pytest.approx(arm, abs=0.05)

@@ -71,19 +71,19 @@ def lumps(**changes):
         (lambda: solve([cube()]).state("car"), SolverError, "there are"),
     ],
 )
-def test_what_cannot_be_is_refused_with_the_reason(make, error, words):
+def test_invalid_arguments_are_refused_with_the_reason(make, error, words):
     with pytest.raises(error, match=words):
         make()
 
 
-def test_more_particles_than_memory_are_refused_before_they_are_made(monkeypatch):
+def test_too_many_particles_for_memory_are_refused_before_allocation(monkeypatch):
     monkeypatch.setattr(model, "available_memory", lambda: 4 * 2**30)
     with pytest.raises(ParticleError, match=r"10,000,000 particles need about .* GiB"):
         model.check_memory(10_000_000, "single")
     model.check_memory(1_000_000, "single")
 
 
-def test_a_velocity_of_a_million_is_refused_or_survived():
+def test_a_velocity_of_a_million_m_s_is_refused_or_survived():
     fast = solve([cube(position=(0, 0, 1), velocity=(0, 0, -1e6))], [ground()])
     with pytest.raises(SolverError, match="fastest particle moves at 1e"):
         fast.step(1.0)
@@ -92,7 +92,7 @@ def test_a_velocity_of_a_million_is_refused_or_survived():
     assert fast.energies().kinetic <= 0.5 * fast.measure.mass[0] * 1e12 * 1.001
 
 
-def test_bodies_that_overlap_from_the_start_stay_calm():
+def test_initially_overlapping_bodies_stay_calm():
     bodies = [cube("a", (0, 0, 0.2)), cube("b", (0.1, 0.05, 0.25))]
     run = solve(bodies, gravity=(0, 0, 0))
     run.step(0.1)
@@ -100,8 +100,8 @@ def test_bodies_that_overlap_from_the_start_stay_calm():
     assert run.energies().total < 1e-3
 
 
-def test_a_face_inside_what_has_been_crushed_is_stopped():
-    """Crushed, a body is all around the nodes next to its surface, and its moments tell nothing."""
+def test_a_face_inside_a_crushed_body_is_stopped():
+    """A crushed body surrounds the nodes next to its surface, so its moments are no help."""
     dx = 0.2
     cell = dx**3
     face = np.array([-0.2 * cell, 0.0, 0.0, 0.5 * cell])
@@ -112,8 +112,8 @@ def test_a_face_inside_what_has_been_crushed_is_stopped():
     assert face_score(0.06, 3.0) < face_score(0.2, 0.5)
 
 
-def test_what_slides_over_a_face_is_not_stopped_by_its_own_end():
-    """Near its end a body is all around a node yet ends to one side: that is not a normal."""
+def test_a_body_sliding_over_a_face_is_not_stopped_by_its_own_end():
+    """Near its end a body surrounds a node but ends on one side: that is not a normal."""
     dx = 0.2
     cell = dx**3
     face = np.array([0.0, 0.0, -0.03 * cell, 0.03 * cell])
@@ -123,7 +123,7 @@ def test_what_slides_over_a_face_is_not_stopped_by_its_own_end():
     assert (a[0], b[0]) == (0.0, -3.0)
 
 
-def test_surfaces_that_look_past_each_other_do_not_touch():
+def test_surfaces_passing_each_other_do_not_touch():
     dx = 0.2
     cell = dx**3
     face = np.array([-0.2 * cell, 0.0, 0.0, 0.5 * cell])
@@ -134,7 +134,7 @@ def test_surfaces_that_look_past_each_other_do_not_touch():
     assert b[0] == 0.0
 
 
-def test_the_energies_add_up_and_nothing_is_gained():
+def test_energies_add_up_and_none_is_gained():
     run = solve([cube(position=(0, 0, 0.2), velocity=(3, 0, -2), friction=0.4)], [ground()])
     start = run.energies()
     for _ in range(10):
@@ -147,7 +147,7 @@ def test_the_energies_add_up_and_nothing_is_gained():
     assert now.dissipated > 0
 
 
-def test_a_moving_box_gives_its_work_to_the_energies():
+def test_work_of_a_moving_box_is_accounted_for():
     ram = Box(name="ram", T_world_box=at(-0.4, 0, 0), size=(0.4, 1, 1), velocity=(2, 0, 0))
     run = solve([cube()], [ram], gravity=(0, 0, 0))
     run.step(0.1)
@@ -158,10 +158,10 @@ def test_a_moving_box_gives_its_work_to_the_energies():
     assert np.asarray(run.colliders[0].T_world_box)[0, 3] == pytest.approx(-0.2)
 
 
-def test_the_solver_takes_back_steps_that_blow_up():
+def test_diverging_steps_are_reverted():
     run = solve([cube(velocity=(0, 0, 0), angular_velocity=(0, 0, 30))], cfl=0.9, gravity=(0, 0, 0))
     start = run.energies().total
-    # Steps twice as long as asked for are beyond what is stable.
+    # Steps twice as long as requested are unstable.
     run.time_step = lambda: 3.0 * run._dt_scale * 0.9 * run.dx / SOFT.wave_speed  # type: ignore[method-assign]
     report = run.step(0.3)
     assert report.rollbacks > 0
@@ -170,7 +170,7 @@ def test_the_solver_takes_back_steps_that_blow_up():
 
 
 def poison(run, times):
-    """Let the first substeps of a run end in NaN, as often as said."""
+    """Make the first substeps of a run end in NaN, the given number of times."""
     advance = run.simulation.advance
     left = [times]
 
@@ -183,7 +183,7 @@ def poison(run, times):
     run.simulation.advance = poisoned
 
 
-def test_the_solver_takes_back_nan_and_halves_the_step():
+def test_nan_is_reverted_and_the_step_halved():
     run, undisturbed = (solve([cube(velocity=(1, 0, 0))], [ground()]) for _ in range(2))
     dt = run.time_step()
     poison(run, 1)
@@ -197,7 +197,7 @@ def test_the_solver_takes_back_nan_and_halves_the_step():
     np.testing.assert_allclose(positions, undisturbed.particles().positions, atol=1e-5)
 
 
-def test_where_smaller_steps_do_not_help_the_solver_stays_at_the_last_good_state():
+def test_the_last_good_state_is_kept_if_smaller_steps_do_not_help():
     run = solve([cube(velocity=(1, 0, 0))], [ground()])
     run.step(0.01)
     before, time = run.particles(), run.time
@@ -209,7 +209,7 @@ def test_where_smaller_steps_do_not_help_the_solver_stays_at_the_last_good_state
     assert run.particles().positions.tobytes() == before.positions.tobytes()
 
 
-def test_a_body_that_flies_out_of_reach_is_named_and_stays_where_it_was():
+def test_a_body_flying_out_of_range_is_named_and_stays_in_place():
     run = solve([cube(position=(26_200, 0, 0), velocity=(1e5, 0, 0))], gravity=(0, 0, 0))
     with pytest.raises(ParticleError, match="stay within 26214 m"):
         run.step(0.01)
@@ -217,7 +217,7 @@ def test_a_body_that_flies_out_of_reach_is_named_and_stays_where_it_was():
     assert np.abs(run.particles().positions[:, 0].mean() - run.measure.centre[0, 0]) < 1e-3
 
 
-def test_impulses_are_the_change_of_momentum():
+def test_impulses_equal_the_change_of_momentum():
     bodies = [
         cube("left", (-0.2, 0, 0), velocity=(2, 0, 0)),
         cube("right", (0.2, 0.05, 0), velocity=(-1, 0, 0)),
@@ -232,7 +232,7 @@ def test_impulses_are_the_change_of_momentum():
     assert np.linalg.norm(change[0]) > 1
 
 
-def test_a_body_goes_on_where_another_solver_left_it():
+def test_a_body_continues_where_another_solver_left_it():
     first = solve(
         [cube(position=(0, 0, 0.17), velocity=(1, 0, -2))], [ground()], precision="double"
     )
@@ -283,6 +283,6 @@ def test_regions_of_one_body_may_differ_in_stiffness():
     assert strain[front == 1].mean() > 5 * strain[front == 0].mean()
 
 
-def test_whole_numbers_of_friction_need_no_kernels_of_their_own():
+def test_integer_friction_needs_no_kernels_of_its_own():
     slippery = model._assemble([cube(friction=0)], 0.1, (0, 0, -9.81), np.float64)
     assert slippery.friction.dtype == np.float64

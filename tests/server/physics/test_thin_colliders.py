@@ -1,4 +1,4 @@
-"""Posts and plates thinner than the cells of the grid hold what meets them, wherever they stand."""
+"""Posts and plates thinner than a grid cell stop what hits them, wherever they stand."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def turned(yaw: float, *position: float) -> np.ndarray:
 
 
 def cars_before_posts(width: float, yaw: float, *, apart=8.0):
-    """Ten cars, each with a post before another place of its front; no gravity."""
+    """Ten cars, each with a post at a different position along its front; no gravity."""
     bodies, posts = [], []
     block = box_particles((LENGTH, WIDTH, 0.4), spacing=SPACING, density=150)
     for k, side in enumerate(LATERAL):
@@ -45,7 +45,7 @@ def cars_before_posts(width: float, yaw: float, *, apart=8.0):
 
 @pytest.mark.parametrize("yaw", [0.0, 0.3])
 @pytest.mark.parametrize("width", [0.05, 0.1, 0.15, 0.2, 0.3])
-def test_a_post_stops_what_meets_it_at_any_place_of_the_front(width, yaw):
+def test_a_post_stops_a_car_at_any_position_along_the_front(width, yaw):
     solver = cars_before_posts(width, yaw)
     mass = solver.bodies[0].particles.mass
     solver.step(0.1)
@@ -59,13 +59,13 @@ def test_a_post_stops_what_meets_it_at_any_place_of_the_front(width, yaw):
         np.testing.assert_allclose(
             contact.impulse / mass, state.velocity - start, atol=0.05 * SPEED
         )
-        # Where the post stands the body has come to rest or goes back.
+        # At the post the body has come to rest or rebounds.
         aside = np.asarray(post.T_world_box)[1, 3] - state.centre[1]
         closing = state.velocity[0] - state.angular_momentum[2] / inertia * aside
         assert closing < 0.1 * SPEED
 
 
-def test_a_plate_of_a_quarter_cell_holds_at_any_phase_of_the_grid():
+def test_a_plate_a_quarter_of_a_cell_thick_holds_at_any_grid_phase():
     dx, thickness = 0.1, 0.025
     block = box_particles((0.4, 0.4, 0.2), spacing=dx / 2, density=200)
     bodies, plates = [], []
@@ -87,12 +87,12 @@ def test_a_plate_of_a_quarter_cell_holds_at_any_phase_of_the_grid():
         solver.step(0.008)
         for state, plate in zip(solver.states(), plates, strict=True):
             assert state.positions[:, 0].max() < plate.T_world_box[0, 3]
-    # The elastic block jumps back, as it does from a thick wall.
+    # The elastic block bounces back, as it does from a thick wall.
     assert max(s.velocity[0] for s in solver.states()) < -2.0
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.5])
-def test_a_plate_that_moves_at_100_metres_a_second_takes_along_what_it_meets(yaw):
+def test_a_plate_moving_at_100_m_s_carries_what_it_hits(yaw):
     block = box_particles((0.3, 0.3, 0.2), spacing=0.05, density=200)
     pose = turned(yaw, 0.4, 0.05, 0)
     plate = Box(
@@ -111,7 +111,7 @@ def test_a_plate_that_moves_at_100_metres_a_second_takes_along_what_it_meets(yaw
     assert before.max() < 0
 
 
-def test_what_starts_within_a_post_stays_together():
+def test_a_body_starting_around_a_post_stays_together():
     block = box_particles((0.6, 0.3, 0.2), spacing=0.05, density=200)
     post = Box(name="post", T_world_box=at(0.02, 0.01, 0), size=(0.05, 0.05, 1))
     body = Body(name="block", particles=block, material=MEDIUM, velocity=(1, 0, 0))

@@ -64,7 +64,7 @@ def test_a_check_fails_on_nan_and_outside_its_tolerance():
     assert not Check("a", float("nan"), 1.0, 10.0).passed
 
 
-def test_the_table_names_cases_there_are_not():
+def test_unknown_cases_are_reported_by_name():
     with pytest.raises(PhysicsError, match=r"no cases \['gravity'\]; there are free_fall"):
         run_table(cases=["spin", "gravity"])
     with pytest.raises(PhysicsError, match="unknown backend"):
@@ -77,12 +77,12 @@ def failing(backend):
 
 
 def breaking(backend):
-    """A case that breaks off."""
+    """A case that raises."""
     raise IndexError("no contact")
 
 
 def fine(backend):
-    """A case that holds, with a curve."""
+    """A case that passes, with a curve."""
     x = np.linspace(0, 1, 5).tolist()
     return [Check("held", 1.0, 1.0, 0.1, curve=ReferenceCurve(x, x, x, "time [s]", "way [m]"))]
 
@@ -95,7 +95,7 @@ def small_table(monkeypatch):
 
 
 @pytest.mark.usefixtures("small_table")
-def test_a_line_that_fails_leaves_the_command_with_code_1_and_all_figures(tmp_path):
+def test_a_failing_line_gives_exit_code_1_and_all_figures(tmp_path):
     out = tmp_path / "table.json"
     with pytest.raises(typer.Exit) as left:
         validate(json=out)
@@ -109,13 +109,13 @@ def test_a_line_that_fails_leaves_the_command_with_code_1_and_all_figures(tmp_pa
 
 
 @pytest.mark.usefixtures("small_table")
-def test_lines_that_all_hold_leave_no_exit_code(tmp_path):
+def test_passing_lines_give_no_exit_code(tmp_path):
     validate(cases="fine", page=tmp_path / "page.html")
     assert "all 1 lines hold" in (tmp_path / "page.html").read_text()
 
 
 @pytest.mark.usefixtures("small_table")
-def test_the_page_shows_every_line_with_plots_that_are_whole():
+def test_the_page_shows_every_line_with_complete_plots():
     page = render_page(run_table(), backend="cpu")
     assert "missed &lt;by&gt; far" in page
     assert "no contact" in page
@@ -127,7 +127,7 @@ def test_the_page_shows_every_line_with_plots_that_are_whole():
         ElementTree.fromstring("<svg" + picture)
 
 
-def test_published_crash_figures_run_where_they_are_named(monkeypatch, tmp_path):
+def test_published_crash_figures_run_when_named(monkeypatch, tmp_path):
     monkeypatch.setattr(crash_tests, "PUBLISHED", {"malibu": fine, "pair": fine})
     validate(cases="published", json=tmp_path / "table.json")
     figures = json.loads((tmp_path / "table.json").read_text())

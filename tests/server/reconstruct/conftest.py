@@ -1,4 +1,4 @@
-"""Small logs made on the spot: a synthetic street, and a painted wall behind a painted box."""
+"""Small generated logs: a synthetic street, and a painted wall behind a painted box."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FRAME_US = 100_000
 
 @dataclass(frozen=True)
 class PaintedSource:
-    """Flat colours: a road, a wall across it, a box that drives from left to right before it."""
+    """Flat colours: a road, a wall across it, and a box that crosses in front of the wall."""
 
     camera: Camera
     boxes: bool

@@ -21,8 +21,8 @@ def box(centre, size) -> ObjectTrack:
     return ObjectTrack("box_0", "box", size, Trajectory.from_transforms(times, [pose, pose]))
 
 
-def test_a_box_seen_frontally_covers_its_nearer_face():
-    # Camera and box axes agree: 2 m wide, 1 m high, front face at 9.5 m; 1 m is 100 / 9.5 px.
+def test_a_box_seen_frontally_covers_its_near_face():
+    # Box aligned with the camera: 2 m wide, 1 m high, front face at 9.5 m; 1 m is 100 / 9.5 px.
     mask = tracks_mask((box((0, 0, 10), (2.0, 1.0, 1.0)),), CAMERA, np.eye(4), 0)
     rows, columns = np.nonzero(mask)
     half = 100 / 9.5
@@ -35,22 +35,22 @@ def test_a_box_behind_the_camera_covers_nothing():
     assert not tracks_mask((box((0, 0, -10), (2.0, 1.0, 1.0)),), CAMERA, np.eye(4), 0).any()
 
 
-def test_a_box_around_the_image_plane_is_cut_not_mirrored():
-    # Beside the camera from 5 m behind it to 5 m before it: only the right half can show it.
+def test_a_box_across_the_image_plane_is_clipped():
+    # The box extends from 5 m behind to 5 m ahead, on the right: only the right half shows it.
     mask = tracks_mask((box((2, 0, 0), (2.0, 1.0, 10.0)),), CAMERA, np.eye(4), 0)
     assert mask.any()
     assert not mask[:, :60].any()
-    # Its far inner edge, 1 m to the right at 5 m, is where it begins.
+    # The mask starts at the far inner edge, 1 m to the right at 5 m.
     assert np.nonzero(mask.any(axis=0))[0].min() == 80
 
 
-def test_a_track_counts_only_when_it_is_there():
+def test_a_track_is_masked_only_during_its_lifetime():
     track = box((0, 0, 10), (2.0, 1.0, 1.0))
     assert tracks_mask((track,), CAMERA, np.eye(4), 30_000).any()
     assert not tracks_mask((track,), CAMERA, np.eye(4), 300_000).any()
 
 
-def test_every_pixel_with_its_centre_in_the_hull_of_a_turned_box_is_set():
+def test_the_mask_of_a_rotated_box_has_the_area_of_its_outline():
     pose = np.eye(4)
     angle = 0.6
     pose[:3, :3] = [
@@ -71,7 +71,7 @@ def test_every_pixel_with_its_centre_in_the_hull_of_a_turned_box_is_set():
     assert mask.sum() == pytest.approx(area, rel=0.02)
 
 
-def test_what_stands_still_does_not_move():
+def test_only_moving_tracks_are_selected():
     log = painted_log()
     assert [t.object_id for t in moving_tracks(log)] == ["other_1"]
     assert moving_tracks(painted_log(frames=2)) == ()

@@ -40,7 +40,7 @@ def test_a_log_on_disk_becomes_a_bundle_with_a_preview(tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["log", "out.r2s", "out.r2s.preview.png"]
 
 
-def test_a_trained_log_leaves_bundle_figures_metrics_and_a_checkpoint(tmp_path):
+def test_training_writes_bundle_previews_metrics_and_checkpoint(tmp_path):
     write_native_log(painted_log(frames=7), tmp_path / "log")
     training = TrainOptions(
         iterations=6, sky_resolution=16, log_every=2, checkpoint_every=3, preview_every=4
@@ -68,19 +68,19 @@ def test_a_trained_log_leaves_bundle_figures_metrics_and_a_checkpoint(tmp_path):
         reconstruct(part, tmp_path / "out.r2s", options, resume=True, overwrite=True)
 
 
-def test_without_training_there_is_nothing_to_resume(tmp_path):
+def test_resuming_without_training_is_refused(tmp_path):
     with pytest.raises(ReconstructError, match="nothing to resume without training"):
         reconstruct(tmp_path, tmp_path / "out.r2s", resume=True)
 
 
-def test_psnr_of_a_constant_error_is_the_textbook_value():
+def test_psnr_of_a_constant_error_matches_the_formula():
     black = np.zeros((4, 5, 3), np.uint8)
     assert psnr(black + np.uint8(51), black) == pytest.approx(20 * np.log10(5))
     assert psnr(black, black) == float("inf")
     assert np.isnan(psnr(black, black, np.zeros((4, 5), bool)))
 
 
-def test_lidar_mask_covers_what_points_project_to_and_nothing_in_the_sky():
+def test_lidar_mask_covers_projected_points_but_not_the_sky():
     log = painted_log(frames=2)
     mask = lidar_mask(log, log.rig["front"], 0)
     assert not mask[:20].any()
@@ -95,7 +95,7 @@ def test_evaluation_needs_a_frame():
 
 
 def shortened(log, frames: int):
-    """The first ``frames`` of a log."""
+    """The first ``frames`` frames of a log."""
     times = log.frame_times_us[:frames]
     ego = Trajectory.from_transforms(times, [log.ego.transform(int(t)) for t in times])
     return replace(log, frame_times_us=times, ego=ego)
@@ -123,16 +123,16 @@ def test_lead_car_truck_and_tanker_are_objects(jam):
     assert all(len(scene.object(k).cloud) > 3000 for k in ("car_0", "truck_2", "truck_3"))
 
 
-def test_without_the_lead_car_its_place_looks_like_the_road_beside_it(jam):
+def test_removing_the_lead_car_reveals_road(jam):
     log, scene = jam
     camera, t_us = log.rig["image_02"], int(log.frame_times_us[3])
     others = {k: o for k, o in scene.objects.items() if k != "car_0"}
     empty = render_logged_view(replace(scene, objects=others), camera, t_us).astype(float)
     with_car = render_logged_view(scene, camera, t_us).astype(float)
-    # Low on the lead car's rear: bumper and number plate where the car stands, else road.
+    # The lower rear of the lead car: bumper and number plate, or road without the car.
     rear = (slice(230, 290), slice(590, 680))
     lane = np.median(empty[230:290, 480:540].reshape(-1, 3), axis=0)
     assert np.abs(with_car[rear] - empty[rear]).mean() > 25
     assert np.abs(np.median(empty[rear].reshape(-1, 3), axis=0) - lane).max() < 60
-    # Road is grey: no red of the lamps, no blue of the plate.
+    # The road is grey, without the red of the lamps or the blue of the plate.
     assert np.ptp(empty[rear], axis=-1).mean() < 25

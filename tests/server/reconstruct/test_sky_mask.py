@@ -25,7 +25,7 @@ def street() -> SyntheticLog:
 
 
 def seen(street: SyntheticLog, frame: int) -> tuple[np.ndarray, np.ndarray]:
-    """Image of the front camera, and the true depth of what it shows, 0 in the sky [m]."""
+    """Front camera image, and its true depth [m], 0 in the sky."""
     camera, t_us = street.rig["front"], int(street.frame_times_us[frame])
     pose = camera.pose(street.ego.transform(t_us))
     _, depth, _ = street.render(pose, camera.K, camera.width, camera.height, t_us)
@@ -33,16 +33,16 @@ def seen(street: SyntheticLog, frame: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("frame", [0, 2])
-def test_the_sky_between_facades_is_found_and_no_facade_above_the_beams(street, frame):
+def test_the_mask_finds_the_sky_and_excludes_facades_above_the_beams(street, frame):
     image, depth = seen(street, frame)
     mask = sky_mask(street, street.rig["front"], frame, image)
     assert (mask & (depth == 0)).sum() > 0.8 * (depth == 0).sum()
-    # A pale roof out of the beams' reach may be taken for it.
+    # A pale roof beyond LiDAR range may be mistaken for sky.
     assert (mask & (depth > 0)).sum() < 0.02 * mask.sum()
     assert (mask & (depth > 0) & (depth < RANGE)).sum() < 0.004 * mask.sum()
 
 
-def test_what_stands_still_is_neither_sky_nor_within_a_box(street):
+def test_still_surfaces_exclude_sky_and_boxes(street):
     camera, image = street.rig["front"], seen(street, 0)[0]
     mask, still = (f(street, camera, 0, image) for f in (sky_mask, still_surfaces))
     assert not (mask & still).any()
@@ -51,7 +51,7 @@ def test_what_stands_still_is_neither_sky_nor_within_a_box(street):
     assert (still <= boxless).all()
 
 
-def test_larger_images_have_the_mask_of_a_smaller_one_and_the_same_share(street):
+def test_the_mask_scales_with_the_image(street):
     camera, image = street.rig["front"], seen(street, 0)[0]
     large = np.repeat(np.repeat(image, 3, 0), 3, 1)
     wide = replace(camera, width=960, height=642, K=camera.K * [[3], [3], [1]])
@@ -71,7 +71,7 @@ class WithoutLidar:
         return sweep_of(np.zeros((0, 3)))
 
 
-def test_without_lidar_nothing_is_said_to_be_sky(street):
+def test_without_lidar_the_mask_is_empty(street):
     blind = replace(street, source=WithoutLidar(street))
     assert not sky_mask(blind, street.rig["front"], 0, seen(street, 0)[0]).any()
 
@@ -88,14 +88,14 @@ OPEN = np.arange(120) < 60
 NOTHING = np.zeros((90, 120), np.bool_)
 
 
-def test_the_sky_ends_at_the_first_strong_edge_and_goes_on_beside_open_columns():
+def test_the_sky_ends_at_a_strong_edge_and_spreads_to_other_columns():
     mask = sky_of_image(painted((TOP, ALL, BLUE)), NOTHING, OPEN)
-    # An edge is as wide as its filter.
+    # The edge has the width of its filter.
     assert mask[:38].all()
     assert not mask[40:].any()
 
 
-def test_the_sky_does_not_go_on_over_an_edge_beyond_open_columns():
+def test_the_sky_does_not_spread_across_a_vertical_edge():
     pale = tuple(c - 25 for c in BLUE)
     image = painted((TOP, ALL, BLUE), (TOP, slice(70, None), pale))
     mask = sky_of_image(image, NOTHING, OPEN)
@@ -103,18 +103,18 @@ def test_the_sky_does_not_go_on_over_an_edge_beyond_open_columns():
     assert not mask[:, 72:].any()
 
 
-def test_a_patch_under_a_bridge_is_sky_where_columns_are_open():
+def test_sky_under_a_bridge_is_found_in_open_columns():
     bridge = (slice(20, 26), ALL, LEAVES)
     mask = sky_of_image(painted((TOP, ALL, BLUE), bridge), NOTHING, OPEN)
     assert mask[28:38, :59].all()
     assert not mask[28:, 60:].any()
 
 
-def test_what_is_as_dark_as_the_rest_is_no_sky():
+def test_dark_regions_are_not_sky():
     assert not sky_of_image(painted((TOP, ALL, LEAVES)), NOTHING, OPEN).any()
 
 
-def test_blocked_pixels_and_those_below_them_in_their_column_are_no_sky():
+def test_blocked_pixels_are_not_sky():
     blocked = NOTHING.copy()
     blocked[10:, :20] = True
     mask = sky_of_image(painted((TOP, ALL, WHITE)), blocked, OPEN)

@@ -1,4 +1,4 @@
-"""What every backend has to do: the pictures of the reference, within a byte."""
+"""The contract of rendering backends: images match the reference within 1/255."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ K = np.array([[80.0, 0, 45], [0, 85, 35], [0, 0, 1]])
 
 
 def check_contract(backend: str) -> None:
-    """Everything below."""
+    """Run all checks of the contract."""
     check_images(backend)
     check_what_was_not_asked_for(backend)
     check_repetition(backend)
 
 
 def check_images(backend: str) -> None:
-    """Colour, alpha, depth and instance of several cameras, poses, degrees and modes."""
+    """Images match the reference for several cameras, poses, SH degrees and modes."""
     for mode in ("classic", "antialiased"):
         options = RasterOptions(background=(0.2, 0.4, 0.6), rasterize_mode=mode, median_depth=True)
         given, expected = _draw(backend, options), _draw("reference", options)
@@ -48,7 +48,7 @@ def check_images(backend: str) -> None:
 
 
 def check_what_was_not_asked_for(backend: str) -> None:
-    """Images that are asked for are the same without the others, and the others absent."""
+    """Requested images do not depend on the other outputs. The others are None."""
     names = ("depth", "instance", "median_depth")
     everything = _draw(backend, RasterOptions(median_depth=True))
     for asked in ((), *((name,) for name in names), ("depth", "instance")):
@@ -60,7 +60,7 @@ def check_what_was_not_asked_for(backend: str) -> None:
 
 
 def check_repetition(backend: str) -> None:
-    """The same request gives the same bits."""
+    """Equal requests give identical images."""
     first, second = (_draw(backend, RasterOptions()) for _ in range(2))
     assert torch.equal(first.rgb, second.rgb)
     assert torch.equal(first.alpha, second.alpha)

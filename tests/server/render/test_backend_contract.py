@@ -1,4 +1,4 @@
-"""Every backend that is usable here keeps the contract, one from outside of the package too."""
+"""All usable backends and a custom one fulfil the backend contract."""
 
 import pytest
 import torch
@@ -25,13 +25,13 @@ ON_GPU = ("cuda", "nvrtc")
         if status.usable
     ],
 )
-def test_a_backend_keeps_the_contract(name):
+def test_backends_fulfil_the_contract(name):
     check_contract(name)
 
 
 @pytest.fixture
 def single():
-    """The plain rasterizer in single precision, registered for one test."""
+    """Register the reference in float32 as a custom backend for one test."""
     before = dict(BACKENDS)
     register_backend(
         RegisteredBackend(
@@ -45,20 +45,20 @@ def single():
     select_backend.cache_clear()
 
 
-def test_a_backend_from_outside_keeps_the_contract(single):
+def test_a_custom_backend_fulfils_the_contract(single):
     check_contract(single)
 
 
-def test_a_backend_from_outside_is_described_and_not_chosen_by_itself(single):
+def test_a_custom_backend_is_listed_but_not_selected_automatically(single):
     assert single in {status.name for status in describe_backends()}
     assert not isinstance(select_backend("auto"), ReferenceBackend)
 
 
-def test_a_name_that_is_taken_is_refused(single):
+def test_registering_a_backend_twice_is_refused(single):
     with pytest.raises(ValueError, match="'single' is registered already"):
         register_backend(BACKENDS[single])
 
 
-def test_an_unknown_backend_is_refused_with_those_there_are(single):
+def test_an_unknown_backend_is_refused_with_the_available_ones(single):
     with pytest.raises(RenderError, match=r"\['cpu', 'cuda', 'nvrtc', 'reference', 'single'\]"):
         select_backend("vulkan")

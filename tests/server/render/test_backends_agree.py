@@ -1,4 +1,4 @@
-"""The CPU backend draws what the reference draws."""
+"""The CPU backend matches the reference."""
 
 from __future__ import annotations
 
@@ -118,9 +118,7 @@ def test_cpu_matches_reference_with_planes_and_radius_clip() -> None:
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
 @pytest.mark.parametrize(("depth", "instance"), [(False, False), (True, False), (False, True)])
-def test_rgb_does_not_depend_on_which_images_are_made(
-    backend: str, depth: bool, instance: bool
-) -> None:
+def test_rgb_does_not_depend_on_the_other_images(backend: str, depth: bool, instance: bool) -> None:
     everything = draw(CLOUDS["random 1"], backend)
     some = draw(CLOUDS["random 1"], backend, depth=depth, instance=instance)
     assert torch.equal(some.rgb, everything.rgb)

@@ -59,7 +59,7 @@ def test_cuda_matches_reference(seed: int, mode: str) -> None:
         for backend in ("cuda", "reference")
     )
     difference = (given.rgb.cpu() - expected.rgb).abs().amax(-1)
-    # gsplat compares and exponentiates in float32 with fast intrinsics: single pixels may differ.
+    # gsplat uses float32 with fast intrinsics, so single pixels may differ.
     assert float((difference > 1 / 255).float().mean()) < 1e-3
     assert float(difference.mean()) < 1e-4
     assert given.depth is not None
@@ -75,7 +75,7 @@ def test_cuda_matches_reference(seed: int, mode: str) -> None:
 
 @pytest.mark.gpu
 @needs_gpu
-def test_cuda_draws_nothing_where_there_is_nothing() -> None:
+def test_cuda_draws_the_background_of_an_empty_scene() -> None:
     options = RasterOptions(background=(0.1, 0.2, 0.3))
     out = rasterize([], np.eye(4)[None], K, 20, 10, options=options, backend="cuda")
     assert out.rgb[0, 3, 4].tolist() == pytest.approx([0.1, 0.2, 0.3])
@@ -130,7 +130,7 @@ print((image != expected).sum())
 """
 
 
-def test_instance_kernel_finds_what_the_reference_finds() -> None:
+def test_instance_kernel_matches_the_reference() -> None:
     result = subprocess.run(
         [sys.executable, "-W", "ignore", "-c", SIMULATION],
         capture_output=True,

@@ -1,4 +1,4 @@
-"""What the CUDA backend is found to lack, and what is said about it."""
+"""Missing requirements of the CUDA backend and the remedies it suggests."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ VERSIONS = {"gsplat": "1.5.3", "numba-cuda": "0.30.4"}
 
 @pytest.fixture
 def machine(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> dict[str, str]:
-    """An H200 with all that is needed but compiled kernels; versions may be taken away."""
+    """An H200 with everything except compiled kernels. Tests may remove package versions."""
     versions = dict(VERSIONS)
 
     def version(name: str) -> str:
@@ -54,19 +54,19 @@ def have_built(*architectures: str) -> None:
     (folder / gsplat_build.RECORD).write_text(json.dumps(record))
 
 
-def test_kernels_that_are_not_compiled_are_to_be_built(machine: dict[str, str]) -> None:
+def test_missing_kernels_are_reported_with_the_build_command(machine: dict[str, str]) -> None:
     need = needs.unmet_gsplat_need()
     assert need is not None
     assert need.name == "kernels"
     assert need.remedy == "real2sim doctor --build-gpu"
 
 
-def test_with_compiled_kernels_nothing_is_missing(machine: dict[str, str]) -> None:
+def test_nothing_is_missing_with_compiled_kernels(machine: dict[str, str]) -> None:
     have_built("8.0", "9.0")
     assert needs.unmet_gsplat_need() is None
 
 
-def test_a_gsplat_that_brings_its_kernels_needs_none_built(
+def test_prebuilt_gsplat_kernels_need_no_build(
     machine: dict[str, str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     (tmp_path / "csrc.cpython-311-x86_64-linux-gnu.so").touch()
@@ -82,9 +82,7 @@ def test_kernels_of_other_devices_do_not_count(machine: dict[str, str]) -> None:
 
 
 @pytest.mark.parametrize("name", ["gsplat", "numba-cuda"])
-def test_a_missing_library_is_named_with_what_installs_it(
-    machine: dict[str, str], name: str
-) -> None:
+def test_a_missing_library_is_named_with_its_extra(machine: dict[str, str], name: str) -> None:
     del machine[name]
     need = needs.unmet_gsplat_need()
     assert need is not None
@@ -92,14 +90,14 @@ def test_a_missing_library_is_named_with_what_installs_it(
     assert "real2sim[server,cuda]" in need.remedy
 
 
-def test_a_gsplat_with_other_functions_is_refused(machine: dict[str, str]) -> None:
+def test_an_unsupported_gsplat_version_is_refused(machine: dict[str, str]) -> None:
     machine["gsplat"] = "1.6.0"
     need = needs.unmet_gsplat_need()
     assert need is not None
     assert "1.6.0" in need.found
 
 
-def test_an_image_lacks_no_more_than_the_device(
+def test_a_container_image_needs_only_the_device(
     machine: dict[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     have_built("9.0")
@@ -111,7 +109,7 @@ def test_an_image_lacks_no_more_than_the_device(
     assert "driver" in need.remedy
 
 
-def test_drawing_on_the_cpu_beside_a_gpu_is_warned_of(
+def test_rendering_on_the_cpu_despite_a_gpu_logs_a_warning(
     machine: dict[str, str],
     caplog: pytest.LogCaptureFixture,
     monkeypatch: pytest.MonkeyPatch,
@@ -128,7 +126,7 @@ def test_drawing_on_the_cpu_beside_a_gpu_is_warned_of(
     assert [record for record in warned if "doctor --build-gpu" in record.getMessage()]
 
 
-def test_code_serves_devices_of_its_generation_and_later_within_it() -> None:
+def test_kernels_serve_devices_of_their_generation() -> None:
     kernels = BuiltKernels(Path("csrc.so"), ("8.0", "12.0"))
     assert kernels.serves((8, 0))
     assert kernels.serves((8, 9))
@@ -137,13 +135,13 @@ def test_code_serves_devices_of_its_generation_and_later_within_it() -> None:
     assert not kernels.serves((9, 0))
 
 
-def test_building_without_gsplat_says_what_installs_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_building_without_gsplat_names_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gsplat_build, "gsplat_package", lambda: None)
     with pytest.raises(RenderError, match=r"real2sim\[server,cuda\]"):
         build_kernels(["9.0"])
 
 
-def test_building_for_a_torch_without_cuda_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_building_with_a_cpu_only_torch_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gsplat_build, "gsplat_package", lambda: Path("gsplat"))
     monkeypatch.setattr(torch.version, "cuda", None)
     with pytest.raises(RenderError, match="CPU only"):
@@ -176,7 +174,7 @@ rasterize_to_pixels_2dgs_fwd(
 """
 
 
-def test_of_gsplat_only_what_is_called_is_compiled(tmp_path: Path) -> None:
+def test_only_the_used_gsplat_functions_are_compiled(tmp_path: Path) -> None:
     package = tmp_path / "gsplat"
     sources = package / "cuda" / "csrc"
     sources.mkdir(parents=True)

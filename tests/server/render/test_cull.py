@@ -1,4 +1,4 @@
-"""Chunks that no camera sees are left out; what is drawn stays the same to the bit."""
+"""Culling of chunks outside the view leaves images unchanged."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ K = np.array([[120.0, 0, 70], [0, 130, 50], [0, 0, 1]])
 
 
 def street(seed: int, *, size: float = 0.05) -> GaussianCloud:
-    """A long cloud along z whose chunks are slices of it."""
+    """A long cloud along z whose chunks are slices along z."""
     random = torch.Generator().manual_seed(seed)
     n = 12 * CHUNK
     means = torch.rand(n, 3, generator=random) * torch.tensor([30.0, 6, 1]) - 3
@@ -64,7 +64,7 @@ def chunks_of(request: RasterRequest) -> list[list[np.ndarray]]:
 @pytest.mark.parametrize("yaw", [0.0, 0.6, 1.57, 3.1, -2.0])
 @pytest.mark.parametrize("size", [0.05, 5.0])
 @pytest.mark.parametrize("options", [{}, {"near_plane": 5.0, "far_plane": 20.0}])
-def test_pictures_are_those_of_all_chunks(yaw, size, options, monkeypatch):
+def test_culled_images_equal_unculled_ones(yaw, size, options, monkeypatch):
     pose = transform_from([-5.0, 1, 3], np.array([0.9, 0.1, 0.4, 0.0]))
     placed = Instance(street(1, size=size), pose, 3, (0.7, 1.5, 1.0))
     instances = [Instance(street(0, size=size)), placed]
@@ -86,7 +86,7 @@ def test_pictures_are_those_of_all_chunks(yaw, size, options, monkeypatch):
         assert torch.equal(getattr(culled, name), getattr(draw(), name)), name
 
 
-def test_what_lies_behind_is_left_out_for_each_camera():
+def test_chunks_behind_each_camera_are_culled():
     instances = [Instance(street(0)), Instance(street(1))]
     ahead, behind = chunks_of(request_of(instances, [0.0, math.pi]))
     for forward, backward in zip(ahead, behind, strict=True):
@@ -95,20 +95,20 @@ def test_what_lies_behind_is_left_out_for_each_camera():
         assert len(forward) + len(backward) < 14
 
 
-def test_objects_far_to_the_side_have_no_chunks_left():
+def test_objects_out_of_view_are_culled():
     aside = Instance(street(0), transform_from([500.0, 0, 0], np.array([1.0, 0, 0, 0])))
     ((chunks,),) = chunks_of(request_of([aside], [0.0]))
     assert len(chunks) == 0
 
 
-def test_deformed_clouds_are_looked_at_as_a_whole():
+def test_deformed_clouds_are_not_culled():
     cloud = street(0)
     covars = torch.eye(3).expand(len(cloud), 3, 3).contiguous()
     ((chunks,),) = chunks_of(request_of([Instance(cloud, covars=covars)], [0.0]))
     assert chunks.tolist() == list(range(12))
 
 
-def test_bounds_hold_all_centres_and_scales_of_a_chunk():
+def test_bounds_enclose_the_means_and_scales_of_a_chunk():
     cloud = street(2)
     bounds, means = bounds_of(cloud), cloud.means.numpy()
     for chunk in range(12):

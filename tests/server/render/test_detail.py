@@ -1,4 +1,4 @@
-"""Small images from merged Gaussians: as good as all Gaussians, and the same in any company."""
+"""Small images from merged Gaussians: quality and independence of the batch."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ FULL = RasterOptions(depth=False, instance=False)
 AUTO = RasterOptions(depth=False, instance=False, detail="auto")
 EVERYTHING = RasterOptions(detail="auto")
 LARGER = 4
-"""How many times as large the image is drawn that is scaled down."""
+"""Supersampling factor of the ground truth."""
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +41,7 @@ def street() -> Scene:
 
 
 def views(street: Scene, camera: str = "front") -> list[View]:
-    """What a camera of 84x84 sees at two instants of the recorded drive."""
+    """84x84 views of a camera at two times of the recorded drive."""
     state = ScenarioState.of(street)
     times = [street.start_us + t for t in (0, 5_000_000)]
     rig = street.rig[camera]
@@ -65,7 +65,7 @@ def psnr(image: np.ndarray, truth: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("camera", ["front", "front_left", "front_right"])
-def test_small_images_are_as_near_to_large_ones_scaled_down_as_all_gaussians(
+def test_merged_gaussians_match_supersampling_like_all_gaussians(
     street: Scene, camera: str
 ) -> None:
     for view in views(street, camera):
@@ -76,7 +76,7 @@ def test_small_images_are_as_near_to_large_ones_scaled_down_as_all_gaussians(
         assert reduced > 22
 
 
-def test_images_of_a_batch_are_those_drawn_alone(street: Scene) -> None:
+def test_batched_images_equal_single_images(street: Scene) -> None:
     given = views(street)
     batch = rasterize_batch(given, SIZE, SIZE, sky=street.sky, options=EVERYTHING, backend="cpu")
     assert batch.depth is not None
@@ -100,7 +100,7 @@ def test_images_of_a_batch_are_those_drawn_alone(street: Scene) -> None:
 
 
 def worlds_of_three() -> WorldViews:
-    """Two worlds with two cameras: a wall, one that changes its colour, and nothing at all."""
+    """Two worlds with two cameras: a wall, a wall with time-varying colour, and an empty cloud."""
     far = np.stack([transform_from([x, 0, 2.0], [1.0, 0, 0, 0]) for x in (-1.0, 0.0, 1.0)])
     poses = np.stack([far, far[::-1]])
     poses[1, 0] = np.nan
@@ -122,7 +122,7 @@ def worlds_of_three() -> WorldViews:
     )
 
 
-def test_worlds_of_the_same_things_are_drawn_as_views_one_by_one() -> None:
+def test_batched_worlds_equal_their_separate_views() -> None:
     worlds, sky = worlds_of_three(), Sky.uniform((0.2, 0.4, 0.6))
     one, many = (
         draw(given, 40, 30, sky=sky, options=EVERYTHING, backend="cpu")
@@ -134,19 +134,19 @@ def test_worlds_of_the_same_things_are_drawn_as_views_one_by_one() -> None:
     assert not torch.equal(many.rgb[0], many.rgb[2])
 
 
-def test_worlds_are_drawn_by_any_backend() -> None:
+def test_any_backend_draws_worlds() -> None:
     small = rasterize_worlds(worlds_of_three(), 20, 16, backend="reference")
     assert small.rgb.shape == (4, 16, 20, 3)
 
 
-def test_a_world_with_a_pose_that_is_not_rigid_is_refused_by_its_place() -> None:
+def test_a_non_rigid_world_pose_is_refused_with_its_index() -> None:
     worlds = worlds_of_three()
     worlds.poses[1, 2] = np.nan
     with pytest.raises(RenderError, match=r"poses\[1, 2\]"):
         rasterize_worlds(worlds, 20, 16, backend="cpu")
 
 
-def test_bits_do_not_depend_on_the_number_of_threads(street: Scene) -> None:
+def test_images_do_not_depend_on_the_number_of_threads(street: Scene) -> None:
     threads = numba.get_num_threads()
     images = []
     try:
@@ -158,7 +158,7 @@ def test_bits_do_not_depend_on_the_number_of_threads(street: Scene) -> None:
     assert torch.equal(images[0], images[-1])
 
 
-def test_larger_images_keep_their_bits(street: Scene) -> None:
+def test_auto_detail_does_not_change_large_images(street: Scene) -> None:
     view = views(street)[0]
     side = int(SMALL_IMAGE_PIXELS**0.5) + 1
     images = [
@@ -196,7 +196,7 @@ def test_depth_and_instance_of_a_small_image(street: Scene) -> None:
 
 
 def wall(gaussians: int = 20_000, *, colour: float = 0.8, opacity: float = 0.9) -> GaussianCloud:
-    """A square of 8 m, 10 m ahead of a camera at the origin."""
+    """An 8 x 8 m wall, 10 m ahead of a camera at the origin."""
     random = torch.Generator().manual_seed(3)
     means = torch.rand(gaussians, 3, generator=random) * 8 - 4
     means[:, 2] = 10.0
@@ -211,7 +211,7 @@ def wall(gaussians: int = 20_000, *, colour: float = 0.8, opacity: float = 0.9) 
 
 
 def centre(instance: Instance, options: RasterOptions = AUTO, *, times: int = 1) -> np.ndarray:
-    """Colour in the middle of an image of an instance alone, ``times`` as large."""
+    """Mean colour at the image centre of one instance, at ``times`` the resolution."""
     enlarged = np.diag([times, times, 1.0]) @ K
     size = SIZE * times
     output = rasterize(
@@ -225,11 +225,11 @@ def large_centre(instance: Instance) -> np.ndarray:
     return centre(instance, FULL, times=LARGER)
 
 
-def test_a_wall_keeps_its_colour_and_stays_opaque() -> None:
+def test_a_merged_wall_keeps_its_colour() -> None:
     assert centre(Instance(wall())) == pytest.approx([0.8] * 3, abs=0.06)
 
 
-def test_thin_gaussians_let_through_as_much_as_before() -> None:
+def test_merged_transparent_gaussians_keep_their_transmittance() -> None:
     thin = Instance(wall(4_000, opacity=0.05))
     assert centre(thin) == pytest.approx(large_centre(thin), abs=0.02)
 
@@ -241,7 +241,7 @@ def test_invisible_gaussians_are_not_merged_into_others() -> None:
     assert centre(Instance(cloud)) == pytest.approx([0.8] * 3, abs=0.06)
 
 
-def test_a_pose_and_a_scale_move_merged_gaussians_too() -> None:
+def test_pose_and_scale_apply_to_merged_gaussians() -> None:
     pose = transform_from([0, 0, 5.0], np.array([1.0, 0, 0, 0]))
     small = Instance(wall(), pose, 7, scale=(0.1, 0.1, 0.5))
     output = rasterize(
@@ -250,12 +250,12 @@ def test_a_pose_and_a_scale_move_merged_gaussians_too() -> None:
     assert output.instance is not None
     assert output.depth is not None
     inside = output.instance[0].int() == 7
-    # 0.8 m at 10 m and 60 px of focal length are 4.8 px.
+    # 0.8 m at 10 m with a focal length of 60 px is 4.8 px.
     assert 3 <= int(inside.any(0).sum()) <= 7
     assert output.depth[0, 42, 42] == pytest.approx(10.0, abs=0.01)
 
 
-def test_colours_that_change_over_time_do_so_in_merged_gaussians() -> None:
+def test_merged_gaussians_have_time_varying_colours() -> None:
     cloud = wall()
     coefficients = torch.full((len(cloud), 1, 3), 0.5)
     colour = TimeColour(coefficients, "cosine", 0, 1_000_000)
@@ -264,33 +264,33 @@ def test_colours_that_change_over_time_do_so_in_merged_gaussians() -> None:
         assert centre(instance) == pytest.approx(large_centre(instance), abs=0.06)
 
 
-def test_deformed_clouds_are_drawn_by_their_covariances() -> None:
+def test_deformed_clouds_use_their_covariances() -> None:
     cloud = wall(2_000)
     covars = (0.2**2 * torch.eye(3)).repeat(len(cloud), 1, 1)
     instance = Instance(cloud, covars=covars)
     assert centre(instance) == pytest.approx(large_centre(instance), abs=5e-3)
 
 
-def test_nothing_and_a_sky_are_drawn() -> None:
+def test_an_empty_view_shows_the_sky() -> None:
     sky = Sky.uniform((0.2, 0.4, 0.6))
     empty = View([Instance(GaussianCloud.empty())], np.eye(4), K)
     image = rasterize_batch([empty], SIZE, SIZE, sky=sky, backend="cpu").rgb
     assert image[0, 5, 5].numpy() == pytest.approx([0.2, 0.4, 0.6], abs=1e-5)
 
 
-def test_a_hierarchy_is_made_once() -> None:
+def test_a_hierarchy_is_cached() -> None:
     cloud = wall(100)
     assert hierarchy_of(cloud) is hierarchy_of(cloud)
 
 
-def test_other_backends_draw_batches_one_by_one() -> None:
+def test_other_backends_draw_batches() -> None:
     given = [View([Instance(wall(50))], np.eye(4), K)] * 2
     batch = rasterize_batch(given, 20, 16, backend="reference")
     assert batch.rgb.shape == (2, 16, 20, 3)
     assert batch.depth is None
 
 
-def test_no_views_are_refused() -> None:
+def test_an_empty_batch_is_refused() -> None:
     with pytest.raises(RenderError, match="at least one view"):
         rasterize_batch([], SIZE, SIZE)
 

@@ -1,4 +1,4 @@
-"""The same picture, bit for bit, from any number of threads and in any process."""
+"""Images are bit-identical for any number of threads and in any process."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def digest(output: RenderOutput) -> str:
     return hashlib.sha256(b"".join(image.numpy().tobytes() for image in images)).hexdigest()
 
 
-def test_bits_do_not_depend_on_the_number_of_threads() -> None:
+def test_images_do_not_depend_on_the_number_of_threads() -> None:
     instances = scene()
     digests = set()
     threads = numba.get_num_threads()
@@ -62,7 +62,7 @@ def test_bits_do_not_depend_on_the_number_of_threads() -> None:
     assert len(digests) == 1
 
 
-def test_bits_do_not_depend_on_what_was_drawn_before() -> None:
+def test_images_do_not_depend_on_earlier_images() -> None:
     instances = scene()
     first = digest(draw(instances))
     draw(instances[1:])
@@ -70,7 +70,7 @@ def test_bits_do_not_depend_on_what_was_drawn_before() -> None:
     assert digest(draw(instances)) == first
 
 
-def test_bits_are_the_same_in_a_new_process_with_one_thread() -> None:
+def test_a_new_single_threaded_process_gives_the_same_image() -> None:
     program = (
         "import importlib.util, sys\n"
         f"spec = importlib.util.spec_from_file_location('t', {__file__!r})\n"
@@ -87,14 +87,14 @@ def test_bits_are_the_same_in_a_new_process_with_one_thread() -> None:
     assert result.stdout.strip() == digest(draw(scene()))
 
 
-def test_pictures_made_in_bands_are_the_same(monkeypatch) -> None:  # type: ignore[no-untyped-def]
+def test_images_drawn_in_bands_are_the_same(monkeypatch) -> None:  # type: ignore[no-untyped-def]
     instances = scene()
     whole = digest(draw(instances))
     monkeypatch.setattr("real2sim_server.render._cpu.drawing.LIST_BUDGET", 2000)
     assert digest(draw(instances)) == whole
 
 
-def test_a_picture_drawn_in_pieces_is_the_same_whatever_is_drawn_between(monkeypatch) -> None:  # type: ignore[no-untyped-def]
+def test_interleaved_drawing_does_not_change_images(monkeypatch) -> None:  # type: ignore[no-untyped-def]
     monkeypatch.setattr("real2sim_server.render._cpu.drawing.PIECE_PIXELS", 4000)
     instances = scene()
     whole, other = digest(draw(instances)), digest(draw(instances[1:]))
@@ -108,7 +108,7 @@ def test_a_picture_drawn_in_pieces_is_the_same_whatever_is_drawn_between(monkeyp
     assert set(between) == {other}
 
 
-def test_bytes_and_depths_made_in_pieces_are_the_same(monkeypatch) -> None:  # type: ignore[no-untyped-def]
+def test_piecewise_conversion_gives_the_same_images(monkeypatch) -> None:  # type: ignore[no-untyped-def]
     monkeypatch.setattr("real2sim_server.render.images.PIECE", 777)
     output, pieces = draw(scene()), []
     assert output.depth is not None
@@ -120,7 +120,7 @@ def test_bytes_and_depths_made_in_pieces_are_the_same(monkeypatch) -> None:  # t
     assert (pieces.count("rgb"), pieces.count("depth")) == (116, 39)
 
 
-def test_clouds_are_read_where_they_lie() -> None:
+def test_clouds_are_not_copied() -> None:
     (instance, _) = scene()
     places = places_of(place_instances([instance], torch.eye(4, dtype=torch.float64)[None]), 0)
     cluster = cluster_of(instance, places, 0)

@@ -1,4 +1,4 @@
-"""Images to bytes and back."""
+"""Encoding of images."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_png_rgb_is_exact_and_in_rgb_order() -> None:
     assert np.array_equal(read_png(encode_rgb(RGB, "png"))[..., ::-1], RGB)
 
 
-def test_jpeg_is_close_and_better_with_quality() -> None:
+def test_jpeg_error_decreases_with_quality() -> None:
     smooth = cv2.GaussianBlur(RGB, (0, 0), 3)
     errors = [
         np.abs(simplejpeg.decode_jpeg(encode_rgb(smooth, "jpeg", quality=q)).astype(int) - smooth)
@@ -51,7 +51,7 @@ def test_jpeg_is_close_and_better_with_quality() -> None:
     assert errors[1].mean() < errors[0].mean()
 
 
-def test_views_of_larger_images_can_be_encoded() -> None:
+def test_strided_views_can_be_encoded() -> None:
     view = RGB[::2, ::-1]
     assert np.array_equal(read_png(encode_rgb(view, "png"))[..., ::-1], view)
     assert encode_rgb(view, "raw") == view.tobytes()
@@ -63,19 +63,19 @@ def test_raw_depth_is_exact() -> None:
     assert np.array_equal(decoded, DEPTH)
 
 
-def test_png_depth_is_right_to_half_a_step() -> None:
+def test_png_depth_is_accurate_to_half_a_step() -> None:
     decoded = read_png(encode_depth(DEPTH, "png"))
     assert decoded.dtype == np.uint16
     np.testing.assert_allclose(decoded / 256, DEPTH, atol=0.5 / 256 + 1e-6)
 
 
-def test_png_depth_keeps_hits_apart_from_nothing_and_saturates() -> None:
+def test_png_depth_reserves_zero_and_saturates() -> None:
     depth = np.array([[0.0, 1e-4, 1e6]], np.float32)
     assert read_png(encode_depth(depth, "png")).tolist() == [[0, 1, 65_535]]
 
 
 @pytest.mark.parametrize("codec", ["raw", "png"])
-def test_instances_are_exact(codec: str) -> None:
+def test_instance_images_are_exact(codec: str) -> None:
     data = encode_instance(INSTANCE, codec)
     decoded = np.frombuffer(data, "<u2").reshape(12, 17) if codec == "raw" else read_png(data)
     assert np.array_equal(decoded, INSTANCE)
@@ -90,7 +90,7 @@ def test_instances_are_exact(codec: str) -> None:
         (INSTANCE, "instance", "jpeg", ("png", "uint16")),
     ],
 )
-def test_encoded_image_says_how_to_read_it(
+def test_encoded_images_state_codec_dtype_and_shape(
     image: np.ndarray, modality: str, codec: str, expected: tuple[str, str]
 ) -> None:
     encoded = encode_image(image, modality, codec)
@@ -110,7 +110,7 @@ def test_encoded_image_says_how_to_read_it(
         (RGB[..., 0].astype(np.uint16), "semantic", "png", "uint8"),
     ],
 )
-def test_what_cannot_be_encoded_is_refused_with_a_reason(
+def test_unsupported_images_and_codecs_are_refused(
     image: np.ndarray, modality: str, codec: str, message: str
 ) -> None:
     with pytest.raises(RenderError, match=message):
@@ -123,7 +123,7 @@ def test_quality_out_of_range_is_refused(quality: int) -> None:
         encode_rgb(RGB, "jpeg", quality=quality)
 
 
-def test_nvjpeg_s_library_makes_jpegs_of_the_same_colours() -> None:
+def test_nvjpeg_and_turbo_jpegs_agree() -> None:
     pytest.importorskip("nvidia.nvimgcodec")
     smooth = cv2.GaussianBlur(RGB, (0, 0), 3)
     encoder = NvjpegEncoder(CPU_ONLY)
@@ -134,7 +134,7 @@ def test_nvjpeg_s_library_makes_jpegs_of_the_same_colours() -> None:
     assert disproof(encoder) is None
 
 
-def test_an_image_that_nvjpeg_cannot_encode_is_encoded_by_turbo(
+def test_turbo_encodes_images_that_nvjpeg_cannot(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     pytest.importorskip("nvidia.nvimgcodec")
@@ -152,12 +152,12 @@ def test_an_image_that_nvjpeg_cannot_encode_is_encoded_by_turbo(
     ]
 
 
-def test_jpegs_are_made_on_the_cpu_where_nothing_is_drawn_on_a_gpu() -> None:
+def test_cpu_rendering_uses_turbo_jpeg() -> None:
     assert jpeg_encoder_for(torch.device("cpu"))[0] is turbo_jpeg
 
 
 @pytest.mark.parametrize("wrong", ["swapped", "nothing"])
-def test_an_encoder_whose_sample_comes_back_wrong_is_not_used(
+def test_an_encoder_that_fails_its_self_test_is_not_used(
     monkeypatch: pytest.MonkeyPatch, wrong: str
 ) -> None:
     pytest.importorskip("nvidia.nvimgcodec")

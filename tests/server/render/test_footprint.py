@@ -1,4 +1,4 @@
-"""What a footprint says about tiles, against asking the ellipse itself."""
+"""Tile footprints against the exact ellipse."""
 
 from typing import NamedTuple
 
@@ -44,7 +44,7 @@ SIZE = Size(np.float32(WIDTH), np.float32(HEIGHT))
 
 @numba.njit
 def columns_by_row(values, first, lane, size):
-    """Rows of tiles, and for each the columns by footprint and by ellipse; and the footprint."""
+    """Per tile row, the columns by footprint and by ellipse; and the footprint."""
     planes = np.zeros(PROJECTION * LANES, np.float32)
     for other in range(LANES):
         for field in range(RECORD):
@@ -87,7 +87,7 @@ def random_records(count, largest, seed=0):
 
 
 @pytest.mark.parametrize("largest", [8, 30, 120])
-def test_short_answers_agree_with_the_ellipse(largest):
+def test_footprint_columns_match_the_ellipse(largest):
     values, _ = random_records(304, largest)
     small = 0
     for index in range(len(values)):
@@ -104,7 +104,7 @@ def test_short_answers_agree_with_the_ellipse(largest):
 
 
 @pytest.mark.parametrize("largest", [8, 30, 120])
-def test_every_tile_with_a_pixel_in_the_ellipse_is_named(largest):
+def test_footprints_cover_every_pixel_of_the_ellipse(largest):
     values, conics = random_records(104, largest, seed=1)
     x, y = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
     for index, (record, conic) in enumerate(zip(values, conics, strict=True)):

@@ -1,4 +1,4 @@
-"""Frames of the cameras of a vehicle."""
+"""Camera frames of a vehicle."""
 
 from __future__ import annotations
 
@@ -44,14 +44,14 @@ def ball(position: tuple[float, float, float], rgb: tuple[float, float, float]) 
     )
 
 
-def test_frames_come_in_the_order_of_cameras_of_mixed_sizes() -> None:
+def test_frames_keep_the_camera_order_for_mixed_sizes() -> None:
     cameras = [camera("a", 32, 20), camera("b", 20, 32), camera("c", 32, 20)]
     frames = render_cameras([], cameras, np.eye(4), backend="cpu")
     assert [frame.camera for frame in frames] == ["a", "b", "c"]
     assert [frame.rgb.shape for frame in frames] == [(20, 32, 3), (32, 20, 3), (20, 32, 3)]
 
 
-def test_camera_of_a_turned_vehicle_sees_what_lies_ahead_of_it() -> None:
+def test_a_camera_turns_with_its_vehicle() -> None:
     red = Instance(ball((0.0, 5.0, 0.0), (1.0, 0.0, 0.0)), instance_id=4)
     ahead = transform_from([0, 0, 0], yaw_quaternion(np.pi / 2))
     looking, away = (
@@ -75,7 +75,7 @@ def test_depth_is_zero_where_alpha_is_below_half() -> None:
     assert frame[0].depth.max() == 0
 
 
-def test_classes_are_of_what_takes_half_of_the_light_and_of_the_sky_behind() -> None:
+def test_semantic_class_is_the_dominant_object_or_the_sky() -> None:
     world = [Instance(ball((5.0, 0, 0), (1, 0, 0)), instance_id=1, semantic=26)]
 
     def classes(sky: Sky | None) -> list[int]:
@@ -90,7 +90,7 @@ def test_classes_are_of_what_takes_half_of_the_light_and_of_the_sky_behind() -> 
     assert classes(None) == [26, SEMANTIC_CLASSES["unlabeled"]]
 
 
-def test_small_images_of_several_vehicles_are_drawn_in_one_go(monkeypatch) -> None:
+def test_small_images_of_several_vehicles_are_batched(monkeypatch) -> None:
     backend, drawn = select_backend("cpu"), []
     draw = type(backend).rasterize_batch
 
@@ -115,13 +115,13 @@ def test_small_images_of_several_vehicles_are_drawn_in_one_go(monkeypatch) -> No
                 np.testing.assert_array_equal(one.images[name], other.images[name])
 
 
-def test_pose_of_a_frame_is_the_camera_in_the_world() -> None:
+def test_frame_pose_is_the_world_camera_pose() -> None:
     vehicle = transform_from([3, 4, 5], yaw_quaternion(0.3))
     frame = render_cameras([], [camera("front", 8, 8)], vehicle, backend="cpu")[0]
     np.testing.assert_allclose(frame.T_world_camera, vehicle @ T_VEHICLE_OPTICAL)
 
 
-def test_only_what_is_asked_for_is_made() -> None:
+def test_only_requested_images_are_made() -> None:
     options = RasterOptions(depth=False, instance=False)
     frame = render_cameras(
         [],
@@ -156,8 +156,8 @@ def test_warm_up_leaves_a_backend_ready(backend: str) -> None:
     assert len(render_cameras([], [camera("a", 4, 4)], np.eye(4), backend=backend)) == 1
 
 
-def test_warm_ups_say_how_many_kernels_they_make_ready(worker_kernels: None) -> None:
-    """In a process of its own, in which no kernel is ready."""
+def test_warm_up_progress_counts_all_kernels(worker_kernels: None) -> None:
+    """Run in a new process without warm kernels."""
     program = (
         "from real2sim_server import render\n"
         "from real2sim_server._numba import made\n"

@@ -1,8 +1,8 @@
-"""Gradients of the CPU backend are those of the reference, which torch differentiates in float64.
+"""Gradients of the CPU backend match the reference, which torch differentiates in float64.
 
-Tolerances are over the largest gradient of an input. Float32 pixels carry rounding of some 1e-5 of
-it, which 99 of 100 values must keep to. A pixel on the rim of a Gaussian, where alpha is cut off at
-1/255, may count for one backend and not for the other: worth up to 1e-3 in scenes this small.
+Tolerances are relative to the largest gradient of an input. 99 % of the values agree within
+float32 rounding (about 1e-5). Pixels on the rim of a Gaussian, where alpha is cut off at 1/255, may
+count in only one backend, which adds up to 1e-3 in these small scenes.
 """
 
 from __future__ import annotations
@@ -155,7 +155,7 @@ def test_all_gradients_match_the_reference(seed: int, mode: str) -> None:
 
 
 @pytest.mark.parametrize("images", [("rgb",), ("alpha",), ("depth",), ("rgb", "depth")])
-def test_losses_of_some_images_only(images: tuple[str, ...]) -> None:
+def test_gradients_match_for_a_subset_of_images(images: tuple[str, ...]) -> None:
     leaves = scene_leaves(5)
     given, _ = gradients(draw_scene, leaves, "cpu", images)
     expected, _ = gradients(draw_scene, leaves, "reference", images)
@@ -163,7 +163,7 @@ def test_losses_of_some_images_only(images: tuple[str, ...]) -> None:
 
 
 @pytest.mark.parametrize("bands", [1, 4, 9, 16])
-def test_each_degree_of_harmonics(bands: int) -> None:
+def test_gradients_match_for_each_sh_degree(bands: int) -> None:
     leaves = cloud_leaves(30 + bands, bands=bands)
     given, _ = gradients(draw_cloud, leaves, "cpu")
     expected, _ = gradients(draw_cloud, leaves, "reference")
@@ -171,14 +171,14 @@ def test_each_degree_of_harmonics(bands: int) -> None:
 
 
 @pytest.mark.parametrize("seed", [40, 41])
-def test_needles(seed: int) -> None:
+def test_gradients_of_needles_match(seed: int) -> None:
     leaves = needle_leaves(seed)
     given, _ = gradients(draw_cloud, leaves, "cpu")
     expected, _ = gradients(draw_cloud, leaves, "reference")
     assert_agree(given, expected)
 
 
-def test_many_solid_layers_end_early_alike() -> None:
+def test_gradients_match_with_early_termination() -> None:
     leaves = cloud_leaves(50, count=1500)
     leaves["opacities"] = 0.6 + 0.4 * leaves["opacities"]
     leaves["scales"] = leaves["scales"] * 4
@@ -188,7 +188,7 @@ def test_many_solid_layers_end_early_alike() -> None:
     assert_agree(given, expected)
 
 
-def test_planes_radius_clip_and_blur() -> None:
+def test_gradients_match_with_planes_radius_clip_and_blur() -> None:
     options = {"near_plane": 2.0, "far_plane": 6.0, "radius_clip": 3.0, "eps2d": 0.1}
     leaves = cloud_leaves(60)
     given, _ = gradients(draw_cloud, leaves, "cpu", **options)
@@ -215,7 +215,7 @@ def test_gradients_of_several_cameras_add_up() -> None:
         torch.testing.assert_close(together[name], sums[name], rtol=1e-5, atol=1e-4, msg=name)
 
 
-def test_one_cloud_in_two_places_gets_the_sum() -> None:
+def test_gradients_of_a_cloud_used_twice_add_up() -> None:
     leaves = cloud_leaves(70)
 
     def draw(own: Leaves, backend: str) -> RenderOutput:
@@ -235,7 +235,7 @@ def test_screen_statistics_match_the_reference() -> None:
     assert given.screen is not None
     assert expected.screen is not None
     for mine, reference in zip(given.screen.radii, expected.screen.radii, strict=True):
-        # At the rim of the image a Gaussian may hold no pixel centre, and ceil may go both ways.
+        # At the image border a Gaussian may cover no pixel centre, and ceil may differ by one.
         different = (mine - reference).abs() > 0
         assert different.float().mean() < 0.02
         assert (mine - reference)[(mine > 0) & (reference > 0)].abs().max() <= 1

@@ -1,4 +1,4 @@
-"""Gradients on a GPU, and how gsplat's centres become screen statistics, which needs none."""
+"""Gradients on a GPU, and screen statistics from gsplat outputs (no GPU needed)."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def request_of(counts: list[int], cameras: int) -> RasterRequest:
     )
 
 
-def test_centres_of_gsplat_find_their_instance_camera_and_gaussian() -> None:
+def test_gsplat_centres_map_to_instances_cameras_and_gaussians() -> None:
     request = request_of([2, 0, 3], cameras=2)
     leaf = torch.zeros(4, 2, requires_grad=True)
     means2d = leaf * 1
@@ -67,14 +67,14 @@ def test_centres_of_gsplat_find_their_instance_camera_and_gaussian() -> None:
     ]
     assert not any(gradients.any() for gradients in screen.gradients)
     (means2d * torch.tensor([[0.5, 0], [0, 1], [0, 0], [0, 1]])).sum().backward()
-    # 2 cameras, half of 200 px in x, half of 100 px in y; Gaussian 2 is seen by both cameras.
+    # 2 cameras, half of 200 px in x and of 100 px in y. Both cameras see Gaussian 2.
     first, empty, third = (gradients.tolist() for gradients in screen.gradients)
     assert first == [[0, 0], [100, 200]]
     assert empty == []
     assert third == [[200, 300], [0, 0], pytest.approx([0, float(np.hypot(600, 400))])]
 
 
-def test_centres_are_not_kept_alive_by_their_own_hook() -> None:
+def test_screen_statistics_are_garbage_collected() -> None:
     means2d = torch.zeros(1, 2, requires_grad=True) * 1
     zero = torch.zeros(1, dtype=torch.int32)
     meta = {"means2d": means2d, "gaussian_ids": zero, "camera_ids": zero}
@@ -119,6 +119,6 @@ def test_cuda_gradients_match_the_reference(mode: str) -> None:
         screens = {f"screen {k}": s.cpu() for k, s in enumerate(output.screen.gradients)}
         found.append(grads | screens)
     for name, expected in found[1].items():
-        # Single pixels at the rims differ, as they do between the pictures.
+        # Single pixels at the rims may differ.
         error = (found[0][name] - expected).abs().flatten()
         assert float(error.quantile(0.98)) < 1e-3 * float(expected.abs().max()), name

@@ -1,4 +1,4 @@
-"""Where gradients must vanish, must not blow up, and must be the same bits."""
+"""Edge cases of gradients: zeros, finite values and determinism."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def gradient(leaves: Leaves, part: str) -> Tensor:
     [([0, 0, -3.0], 0.5), ([50.0, 0, 3], 0.5), ([0, 0, 3.0], 0.0), ([0, 0, 0.0], 0.5)],
     ids=["behind the camera", "off the image", "opacity 0", "at the camera"],
 )
-def test_gradient_of_what_is_not_drawn_is_exactly_zero(
+def test_gradients_of_invisible_gaussians_are_zero(
     backend: str, position: list[float], opacity: float
 ) -> None:
     leaves = leaves_of([[0.1, 0, 3], position])
@@ -80,7 +80,7 @@ def test_gradient_of_what_is_not_drawn_is_exactly_zero(
 
 
 @both
-def test_gradient_of_what_is_hidden_is_exactly_zero(backend: str) -> None:
+def test_gradients_of_hidden_gaussians_are_zero(backend: str) -> None:
     wall = [[0.0, 0, 2 + 0.1 * k] for k in range(4)]
     leaves = leaves_of([*wall, [0, 0, 5]], opacity=0.99)
     leaves["scales"][:4] = 10
@@ -93,7 +93,7 @@ def test_gradient_of_what_is_hidden_is_exactly_zero(backend: str) -> None:
 
 
 @both
-def test_where_alpha_is_held_at_its_limit_only_colour_and_depth_move(backend: str) -> None:
+def test_capped_alpha_passes_only_colour_and_depth_gradients(backend: str) -> None:
     leaves = leaves_of([[0, 0, 3]], opacity=1.0, sigma=1000.0)
     output = draw(leaves, backend)
     assert output.depth is not None
@@ -117,14 +117,14 @@ def test_clamped_colour_has_no_gradient(backend: str) -> None:
 
 
 @both
-def test_gradient_of_one_pixel_is_the_formula(backend: str) -> None:
+def test_gradient_of_one_pixel_matches_the_formula(backend: str) -> None:
     leaves = leaves_of([[0.0125, 0.0125, 1.0]], opacity=0.6, sigma=0.05)
     with torch.no_grad():
         leaves["quats"][:] = torch.tensor([1.0, 0, 0, 0])
     output = draw(leaves, backend, eps2d=0.0)
     output.alpha[0, 15, 22].backward()
     sigma2 = (40 * 0.05) ** 2
-    # The centre is seen at pixel (20.5, 15.5), so that the pixel lies 2 px to its right.
+    # The centre projects to pixel (20.5, 15.5), 2 px left of the pixel.
     alpha = 0.6 * math.exp(-0.5 * 4 / sigma2)
     slant = 1 + 0.0125**2
     assert float(output.alpha[0, 15, 22].detach()) == pytest.approx(alpha, rel=2e-3)
@@ -136,7 +136,7 @@ def test_gradient_of_one_pixel_is_the_formula(backend: str) -> None:
 
 
 @both
-def test_length_of_quaternions_does_not_matter(backend: str) -> None:
+def test_gradients_account_for_quaternion_normalization(backend: str) -> None:
     short, long = leaves_of([[0.3, 0, 3]]), leaves_of([[0.3, 0, 3]])
     for leaves in (short, long):
         leaves["scales"] = torch.tensor([[0.3, 0.1, 0.2]])
@@ -150,7 +150,7 @@ def test_length_of_quaternions_does_not_matter(backend: str) -> None:
 
 
 @both
-def test_a_picture_of_nothing_has_no_gradient(backend: str) -> None:
+def test_an_empty_image_has_empty_gradients(backend: str) -> None:
     leaves = leaves_of([])
     backward(draw(leaves, backend))
     for part in PARTS:
@@ -158,7 +158,7 @@ def test_a_picture_of_nothing_has_no_gradient(backend: str) -> None:
 
 
 @both
-def test_second_backward_through_a_kept_graph_gives_the_same(backend: str) -> None:
+def test_a_second_backward_through_a_retained_graph_is_equal(backend: str) -> None:
     leaves = leaves_of([[0.1, 0, 3], [0, 0.2, 4]])
     output = draw(leaves, backend)
     loss = output.rgb.square().sum()
@@ -170,7 +170,7 @@ def test_second_backward_through_a_kept_graph_gives_the_same(backend: str) -> No
 
 
 @both
-def test_passes_in_flight_do_not_disturb_each_other(backend: str) -> None:
+def test_concurrent_passes_are_independent(backend: str) -> None:
     one, other = leaves_of([[0.1, 0, 3]]), leaves_of([[-0.2, 0.1, 2], [0, 0, 3]])
     first, second = draw(one, backend), draw(other, backend)
     backward(first)
@@ -180,7 +180,7 @@ def test_passes_in_flight_do_not_disturb_each_other(backend: str) -> None:
     assert torch.equal(gradient(one, "means"), gradient(alone, "means"))
 
 
-def test_work_space_is_used_again_once_a_pass_is_gone() -> None:
+def test_workspaces_are_reused() -> None:
     from real2sim_server.render._cpu.backend import CpuBackend
 
     backend = CpuBackend()
@@ -202,7 +202,7 @@ def test_changing_an_input_in_place_before_backward_is_refused() -> None:
         backward(output)
 
 
-def test_intrinsics_that_want_a_gradient_are_refused() -> None:
+def test_intrinsics_that_require_gradients_are_refused() -> None:
     cloud = GaussianCloud(*leaves_of([[0, 0, 3]]).values())
     with pytest.raises(RenderError, match="Ks carry no gradient"):
         rasterize(
@@ -214,7 +214,7 @@ def test_intrinsics_that_want_a_gradient_are_refused() -> None:
         )
 
 
-def test_only_what_requires_a_gradient_gets_one() -> None:
+def test_only_inputs_that_require_gradients_get_them() -> None:
     leaves = leaves_of([[0, 0, 3]])
     pose = torch.eye(4, dtype=torch.float64).requires_grad_()
     cloud = GaussianCloud(*(leaves[part] for part in PARTS))
@@ -225,7 +225,7 @@ def test_only_what_requires_a_gradient_gets_one() -> None:
     assert all(leaf.grad is None for leaf in leaves.values())
 
 
-def test_screen_gradients_come_with_backward_and_are_scaled_by_half_the_image() -> None:
+def test_screen_gradients_are_filled_by_backward() -> None:
     leaves = leaves_of([[0.3, 0, 3], [0, 0, -3]])
     output = draw(leaves, "cpu", track_screen=True)
     assert output.screen is not None
@@ -235,7 +235,7 @@ def test_screen_gradients_come_with_backward_and_are_scaled_by_half_the_image() 
     assert radii[0, 1] == 0
     assert not gradients.any()
     output.alpha[0, 15, 24].backward()
-    # One pixel: the gradient by the centre is that by the mean, were the shape to stay as it is.
+    # With one pixel, the signed and the absolute gradient are equal.
     assert float(gradients[0, 0]) == pytest.approx(float(gradients[0, 1]), rel=1e-4)
     assert not gradients[1].any()
     plain = leaves_of([[0.3, 0, 3], [0, 0, -3]])
@@ -277,7 +277,7 @@ def all_bits(count: int) -> bytes:
     return b"".join(tensor.numpy().tobytes() for tensor in held if tensor is not None)
 
 
-def test_bits_do_not_depend_on_the_number_of_threads() -> None:
+def test_gradients_do_not_depend_on_the_number_of_threads() -> None:
     threads = numba.get_num_threads()
     found = set()
     try:
@@ -289,7 +289,7 @@ def test_bits_do_not_depend_on_the_number_of_threads() -> None:
     assert len(found) == 1
 
 
-def test_bits_do_not_depend_on_what_was_drawn_before() -> None:
+def test_gradients_do_not_depend_on_earlier_images() -> None:
     first = all_bits(20_000)
     all_bits(3_000)
     assert all_bits(20_000) == first

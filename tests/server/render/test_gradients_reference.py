@@ -1,8 +1,8 @@
-"""The oracle itself: the reference's gradients against central differences.
+"""Gradients of the reference against central differences.
 
-The scene has nothing to jump over: every Gaussian covers the whole of a small picture with alpha
-between 1/255 and 0.999, no pixel is finished early, no colour is clamped, and the order by depth
-is far from changing. Images are given out in float64 here.
+The scene is differentiable: every Gaussian covers the whole of a small image with alpha between
+1/255 and 0.999, no pixel terminates early, no colour is clamped, and the depth order is stable.
+Images are float64.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ WIDTH, HEIGHT = 9, 7
 K = np.array([[[30.0, 0, 4.2], [0, 28, 3.4], [0, 0, 1]]])
 BACKEND = ReferenceBackend(image_dtype=torch.float64)
 STEP = 2.0**-9
-"""Exact in float32 next to values of order one, so that the inputs differ by just that."""
+"""Step of the differences, exact in float32 for values of order one."""
 
 
 def smooth_leaves() -> dict[str, Tensor]:
@@ -91,19 +91,19 @@ def central_differences(name: str, leaves: dict[str, Tensor], mode: str) -> Tens
 
 @pytest.mark.parametrize("mode", ["classic", "antialiased"])
 @pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities", "sh", "faces"])
-def test_gradient_is_the_central_difference(name: str, mode: str) -> None:
+def test_gradients_match_central_differences(name: str, mode: str) -> None:
     leaves = smooth_leaves()
     leaf = leaves[name].clone().requires_grad_()
     loss(leaves | {name: leaf}, mode).backward()
     expected = central_differences(name, leaves, mode)
     assert leaf.grad is not None
     assert expected.abs().max() > 0.01
-    # The third derivative times STEP^2 / 6, and float32 of the gradient.
+    # Error: third derivative times STEP^2 / 6, and float32 rounding of the gradient.
     torch.testing.assert_close(leaf.grad.double(), expected, rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize("name", ["T_world_object", "viewmats"])
-def test_gradient_by_poses_is_the_central_difference_along_rigid_motions(name: str) -> None:
+def test_pose_gradients_match_central_differences(name: str) -> None:
     leaves = smooth_leaves()
     pose = leaves[name].double()
     constant_sky = leaves | {"faces": torch.full((6, 1, 1, 3), 0.3)}

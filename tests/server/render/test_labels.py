@@ -1,4 +1,4 @@
-"""Labels of one walk against the passes that draw each by itself."""
+"""Labels from one pass against separate passes."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def at(z: float, x: float = 0.0) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def instances() -> list[Instance]:
-    """A background, and an object before another that it half hides."""
+    """A background and two objects, one partly occluded."""
     return [
         Instance(cloud(600, 1), at(8)),
         Instance(cloud(400, 2), at(4, 0.5), 3),
@@ -60,7 +60,7 @@ def drawn(instances, *, sky=SKY):
     )
 
 
-def test_one_walk_gives_the_bits_of_the_passes(instances):
+def test_labels_equal_separate_passes(instances):
     found, passes = label(instances), drawn(instances)
     assert torch.equal(found.rgb, passes.rgb[0])
     np.testing.assert_array_equal(found.depth, passes.median_depth[0].numpy())
@@ -68,7 +68,7 @@ def test_one_walk_gives_the_bits_of_the_passes(instances):
     assert set(np.unique(found.instance)) == {0, 3, 5}
 
 
-def test_objects_alone_are_those_drawn_by_themselves(instances):
+def test_object_depths_equal_objects_drawn_alone(instances):
     for window, alone in zip(WINDOWS, label(instances).alone, strict=True):
         own = [i for i in instances if i.instance_id == window.instance_id]
         depth = drawn(own).median_depth[0].numpy()
@@ -92,8 +92,8 @@ def test_labels_do_not_depend_on_the_number_of_threads(instances):
         np.testing.assert_array_equal(first, second)
 
 
-def test_depth_along_rays_is_that_of_the_disc_and_not_of_its_centre():
-    """A large disc leant by 60 degrees: its depth changes by metres across the image."""
+def test_depth_along_rays_follows_the_disc():
+    """A large disc tilted by 60 degrees, whose depth varies by metres across the image."""
     turn = torch.tensor([[np.cos(np.pi / 6), 0, np.sin(np.pi / 6), 0]], dtype=torch.float32)
     disc = GaussianCloud(
         means=torch.tensor([[0.0, 0, 0]]),
@@ -104,7 +104,7 @@ def test_depth_along_rays_is_that_of_the_disc_and_not_of_its_centre():
     )
     found = label([Instance(disc, at(6))], along_rays=True)
     x = (np.arange(WIDTH) + 0.5 - 52) / 90
-    # The plane through (0, 0, 6) whose normal is leant by 60 degrees: z = 6 - tan(60) x.
+    # The plane through (0, 0, 6) with its normal tilted by 60 degrees: z = 6 - tan(60) x.
     true = 6 / (1 + np.tan(np.pi / 3) * x)
     seen = found.depth[36] > 0
     assert seen.sum() > 25
@@ -112,7 +112,7 @@ def test_depth_along_rays_is_that_of_the_disc_and_not_of_its_centre():
     assert np.ptp(true[seen]) > 0.5
 
 
-def test_a_lower_level_lies_no_nearer_and_is_there_where_half_is(instances):
+def test_a_lower_level_gives_no_smaller_depths(instances):
     half, fifth = label(instances, level=0.5).depth, label(instances, level=0.2).depth
     assert ((fifth > 0) == (half > 0)).all()
     assert (fifth >= half).all()

@@ -1,4 +1,4 @@
-"""Arithmetic of eight numbers at a time, against NumPy in float64."""
+"""Eight-lane SIMD arithmetic against NumPy in float64."""
 
 import numba
 import numpy as np
@@ -39,7 +39,7 @@ def logarithms(numbers):
         logarithm_of_eight(numbers[first : first + LANES])
 
 
-def test_logarithm_over_all_opacities():
+def test_logarithm_is_accurate_for_all_opacities():
     opacities = np.concatenate([np.geomspace(1e-6, 1, 4000), np.linspace(0.9, 1, 96)])
     opacities = opacities.astype(np.float32)
     found = opacities.copy()
@@ -54,5 +54,5 @@ def test_logarithm_of_one_is_zero():
     assert (numbers == 0).all()
 
 
-def test_a_mask_and_its_bits_say_the_same():
+def test_masks_round_trip_to_bits():
     assert [through_a_mask(lanes) for lanes in range(256)] == list(range(256))

@@ -1,4 +1,4 @@
-"""Lenses and rolling shutters of the shipped street against ray-cast truth."""
+"""Lenses and rolling shutters on the demo street against ray-cast ground truth."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def psnr(image, truth):
     return 10 * np.log10(255**2 / ((image - truth) ** 2).mean())
 
 
-def test_rays_through_a_pinhole_lose_nothing(street):
+def test_ray_rendering_is_as_accurate_as_the_pinhole(street):
     scene, log = street
     camera, t_us = scene.rig["front"], int(log.frame_times_us[FRAME])
     still = CameraMotion.still(camera.pose(log.ego.transform(t_us)))
@@ -58,8 +58,8 @@ def test_rays_through_a_pinhole_lose_nothing(street):
 
 
 def squares_by_direction(scene, log, camera, pose, t_us):
-    """Sum of squared errors by solid angle, and the solid angle [sr], within 94.5 degrees of the
-    axis of the front camera."""
+    """Squared error integrated over solid angle, and the solid angle [sr], within 94.5 degrees of
+    the front camera's axis."""
     place = np.stack(np.meshgrid(*(np.arange(n) + 0.5 for n in (camera.width, camera.height))), -1)
     rays, seen = camera.unproject(place)
     across, down = (
@@ -81,8 +81,8 @@ def squares_by_direction(scene, log, camera, pose, t_us):
     [Fisheye(max_angle=np.radians(95)), FTheta((0, 1, 0.01, -0.02), linear=(1.01, 0.01, 0))],
     ids=["fisheye", "f_theta"],
 )
-def test_wide_lenses_lose_nothing_to_pinholes_that_share_their_solid_angle(street, lens):
-    # Five pinholes of 90 degrees look at every direction of the lens, with as many pixels.
+def test_wide_lenses_are_as_accurate_as_pinholes_of_equal_solid_angle(street, lens):
+    # Five 90 degree pinholes cover all directions of the lens with the same number of pixels.
     scene, log = street
     focal, t_us = 60.0, int(log.frame_times_us[FRAME])
     pose = scene.rig["front"].pose(log.ego.transform(t_us))
@@ -105,7 +105,7 @@ def test_wide_lenses_lose_nothing_to_pinholes_that_share_their_solid_angle(stree
     assert 10 * np.log10(by_pinholes[0] / sums[0]) > -0.3
 
 
-def test_a_rolling_shutter_at_15_metres_a_second_is_worth_drawing(street):
+def test_rolling_shutter_is_accurate_at_15_metres_per_second(street):
     scene, log = street
     camera, t_us = scene.rig["front"], int(log.frame_times_us[FRAME])
     ego = log.ego.transform(t_us)

@@ -1,4 +1,4 @@
-"""Cameras with lenses and rolling shutters: the CPU's kernels against plain torch, and truths."""
+"""Lenses and rolling shutters: CPU kernels against plain torch and closed forms."""
 
 from dataclasses import replace
 
@@ -72,7 +72,7 @@ def cloud(count, spread, sizes, *, seed):
 
 @pytest.fixture(scope="module")
 def instances():
-    """Around the camera small and large things, needles and discs; one that moves, one deformed."""
+    """Gaussians of many shapes around the camera, a moving car and a deformed object."""
     world = cloud(80, (9.0, 9.0, 2.0), (0.03, 0.9), seed=1)
     car = cloud(40, (0.8, 0.5, 0.4), (0.02, 0.2), seed=2)
     bent = cloud(20, (0.5, 0.5, 0.5), (0.1, 0.2), seed=3)
@@ -120,7 +120,7 @@ def difference(a, b):
 
 
 @pytest.mark.parametrize("name", CAMERAS)
-def test_the_kernels_draw_what_plain_torch_draws(name, instances, sky):
+def test_cpu_kernels_match_plain_torch(name, instances, sky):
     ours = draw(camera(name), instances, sky)
     truth = draw(camera(name), instances, sky, backend="reference")
     assert difference(ours.rgb, truth.rgb) < 2 / 255
@@ -134,7 +134,7 @@ def test_the_kernels_draw_what_plain_torch_draws(name, instances, sky):
 
 
 @pytest.mark.parametrize("name", ["right"])
-def test_antialiased_images_agree_too(name, instances):
+def test_antialiased_images_match_plain_torch(name, instances):
     options = RasterOptions(rasterize_mode="antialiased")
     ours = draw(camera(name), instances, options=options)
     truth = draw(camera(name), instances, options=options, backend="reference")
@@ -142,7 +142,7 @@ def test_antialiased_images_agree_too(name, instances):
 
 
 @pytest.mark.parametrize("name", ["fisheye", "down"])
-def test_any_number_of_threads_gives_the_same_bits(name, instances, sky):
+def test_images_do_not_depend_on_the_number_of_threads(name, instances, sky):
     before = numba.get_num_threads()
     several = draw(camera(name), instances, sky)
     try:
@@ -154,7 +154,7 @@ def test_any_number_of_threads_gives_the_same_bits(name, instances, sky):
         assert torch.equal(getattr(several, image), getattr(one, image)), image
 
 
-def test_a_lens_without_distortion_draws_the_pinhole_picture(instances, sky):
+def test_a_lens_without_distortion_matches_the_pinhole(instances, sky):
     small = [
         replace(i, cloud=cloud(400, (6.0, 6, 2), (0.01, 0.05), seed=k), covars=None)
         for k, i in enumerate(instances)
@@ -167,7 +167,9 @@ def test_a_lens_without_distortion_draws_the_pinhole_picture(instances, sky):
     assert float((plain.depth - same.depth).abs().median()) < 1e-3
 
 
-def test_a_lens_without_distortion_looks_at_as_many_pixels_as_the_pinhole(instances, monkeypatch):
+def test_a_lens_without_distortion_has_no_larger_footprints_than_the_pinhole(
+    instances, monkeypatch
+):
     far = transform_from([15.0, 3.0, 1.5], [1.0, 0, 0, 0])
     things = [Instance(cloud(400, (1.5, 1.5, 0.8), (0.05, 0.3), seed=7), far)]
     looked_at = []
@@ -185,7 +187,7 @@ def test_a_lens_without_distortion_looks_at_as_many_pixels_as_the_pinhole(instan
     assert lens < 1.1 * pinhole
 
 
-def test_what_the_lens_does_not_see_is_black_and_of_no_class(instances, sky):
+def test_pixels_outside_the_lens_are_black_and_unlabelled(instances, sky):
     [frame] = render_cameras(
         instances,
         [replace(camera("fisheye"), T_vehicle_camera=T_VEHICLE_OPTICAL)],
@@ -201,7 +203,7 @@ def test_what_the_lens_does_not_see_is_black_and_of_no_class(instances, sky):
     assert frame.rgb[16, 24].any()
 
 
-def test_a_wide_lens_shows_ranges_and_what_lies_beside_it():
+def test_a_wide_lens_sees_beyond_90_degrees_and_gives_ranges():
     ball = cloud(1, (0.0, 0, 0), (0.3, 0.3001), seed=0)
     ball = replace(ball, opacities=torch.tensor([0.99]))
     beside = POSE @ [3.0, 0, -0.1, 1.0]  # 92 degrees from the axis
@@ -213,7 +215,7 @@ def test_a_wide_lens_shows_ranges_and_what_lies_beside_it():
     np.testing.assert_allclose(seen.depth[0, row, column], np.hypot(3.0, 0.1), rtol=1e-4)
 
 
-def test_gradients_through_a_lens_agree_with_finite_differences(instances):
+def test_lens_gradients_match_finite_differences(instances):
     given = instances[1].cloud
     means = given.means[:3].clone().requires_grad_()
     small = GaussianCloud(
@@ -222,7 +224,7 @@ def test_gradients_through_a_lens_agree_with_finite_differences(instances):
     placed = replace(instances[1], cloud=small)
 
     exact = ReferenceBackend(image_dtype=torch.float64)
-    sharp = RasterOptions(eps2d=0.0)  # Where the blur is wide is a constant to gradients.
+    sharp = RasterOptions(eps2d=0.0)  # Gradients treat the blur width as constant.
 
     def brightness(offset):
         moved = replace(placed, cloud=replace(small, means=means.detach() + offset))
@@ -235,7 +237,7 @@ def test_gradients_through_a_lens_agree_with_finite_differences(instances):
     np.testing.assert_allclose(float(means.grad[0, 1]), slope, rtol=0.05)
 
 
-def test_a_backend_that_knows_no_lens_says_what_to_do(instances):
+def test_a_backend_without_lenses_names_an_alternative(instances):
     class Plain:
         name = "plain"
 
@@ -243,7 +245,7 @@ def test_a_backend_that_knows_no_lens_says_what_to_do(instances):
         draw(camera("fisheye"), instances, backend=Plain())
 
 
-def test_training_through_a_lens_is_refused_on_the_cpu(instances):
+def test_lens_gradients_on_the_cpu_are_refused(instances):
     given = replace(
         instances[0].cloud, opacities=instances[0].cloud.opacities.clone().requires_grad_()
     )
@@ -269,7 +271,7 @@ def test_optics_of_another_camera_are_refused(instances, change):
         )
 
 
-def test_a_pole_leans_as_far_as_speed_and_read_out_say(instances):
+def test_a_rolling_shutter_leans_a_pole_by_speed_and_readout(instances):
     points = torch.zeros(200, 3)
     points[:, 2] = torch.linspace(-3, 3, 200)
     pole = GaussianCloud(
@@ -286,7 +288,7 @@ def test_a_pole_leans_as_far_as_speed_and_read_out_say(instances):
     seen = draw(rolling, [placed], motion=motion).alpha[0].numpy()
     columns = np.arange(SIZE[0]) + 0.5
     middles = (seen * columns).sum(1) / seen.sum(1)
-    # The camera goes to the left, by 15 * 0.03 m from the first to the last row.
+    # The camera moves left by 15 * 0.03 m from the first to the last row.
     expected = 24 + 35 * 15 * 0.03 * (np.arange(SIZE[1]) / (SIZE[1] - 1) - 0.5) / 6
     np.testing.assert_allclose(middles[4:-4], expected[4:-4], atol=0.03)
     assert select_backend("cpu").draws_lenses

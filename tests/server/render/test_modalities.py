@@ -1,4 +1,4 @@
-"""What every sensor modality keeps to; new ones are tested here by being registered."""
+"""The contract of sensor modalities, for every registered modality."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ HEIGHT, WIDTH = 6, 9
 
 @pytest.fixture
 def output() -> RenderOutput:
-    """What a pass of two cameras gives, all switches on."""
+    """Output of a pass with two cameras and all images."""
     values = torch.linspace(0.0, 1.0, 2 * HEIGHT * WIDTH).reshape(2, HEIGHT, WIDTH)
     return RenderOutput(
         rgb=values[..., None].repeat(1, 1, 1, 3),
@@ -42,7 +42,7 @@ def test_every_public_modality_is_registered():
 
 
 @pytest.mark.parametrize("name", modality_names())
-def test_pixels_have_the_dtype_and_shape_that_the_modality_states(name, output):
+def test_pixels_have_the_declared_dtype_and_shape(name, output):
     modality = modality_of(name)
     pixels = modality.pixels(output)
     assert pixels.dtype == modality.dtype
@@ -60,7 +60,7 @@ def test_raw_bytes_are_the_pixels(name, output):
 
 @pytest.mark.parametrize("codec", get_args(Codec))
 @pytest.mark.parametrize("name", modality_names())
-def test_every_codec_of_the_wire_has_an_answer(name, codec, output):
+def test_every_protocol_codec_is_encoded(name, codec, output):
     encoded = encode_image(modality_of(name).pixels(output)[0], name, codec)
     assert encoded.codec in modality_of(name).codecs
     assert np.dtype(encoded.dtype).name == encoded.dtype
@@ -74,7 +74,7 @@ def test_an_image_of_another_dtype_is_refused(name):
 
 
 @pytest.mark.parametrize("name", modality_names())
-def test_its_switch_alone_is_turned_on(name):
+def test_a_modality_enables_only_its_switch(name):
     options = options_for([name], RasterOptions())
     switch = modality_of(name).switch
     assert (options.depth, options.instance) == (switch == "depth", switch == "instance")
@@ -93,7 +93,7 @@ def changed(**values) -> SensorModality:
         ({"switch": "heat"}, "heat"),
     ],
 )
-def test_a_modality_that_cannot_work_is_not_registered(values, reason):
+def test_an_invalid_modality_is_not_registered(values, reason):
     with pytest.raises(ValueError, match=reason):
         register(changed(**values))
     assert "other" not in modality_names()

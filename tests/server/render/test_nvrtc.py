@@ -1,4 +1,4 @@
-"""The serving kernels, run on the CPU from their own source, draw what the reference draws."""
+"""The serving kernels, compiled for the CPU, match the reference."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def everything() -> list[Instance]:
 
 
 def shifted(instances: list[Instance], offset: np.ndarray) -> list[Instance]:
-    """The same world elsewhere: backgrounds by their means, objects by their poses."""
+    """The scene translated by ``offset``."""
     moved = []
     for instance in instances:
         if instance.T_world_object is None:
@@ -100,13 +100,11 @@ def draw(
 
 @pytest.mark.parametrize("mode", ["classic", "antialiased"])
 @pytest.mark.parametrize("kilometres", [0, 2, 10])
-def test_pictures_are_those_of_the_reference(
-    serving: NvrtcBackend, kilometres: float, mode: str
-) -> None:
+def test_images_match_the_reference(serving: NvrtcBackend, kilometres: float, mode: str) -> None:
     at = np.array([0.8, -0.6, 0]) * 1e3 * kilometres
     instances, options = shifted(everything(), at), RasterOptions(rasterize_mode=mode)
     given, expected = (draw(b, instances, options, at) for b in (serving, "reference"))
-    # Far within 1/255: the kernels round where the reference has float64, and nothing else.
+    # The kernels differ from the float64 reference only by rounding.
     torch.testing.assert_close(given.rgb, expected.rgb, rtol=0, atol=1e-4)
     torch.testing.assert_close(given.alpha, expected.alpha, rtol=0, atol=1e-4)
     assert given.depth is not None
@@ -124,7 +122,7 @@ def test_pictures_are_those_of_the_reference(
     unmet_nvrtc_need() is not None, reason="no GPU that the kernels can be compiled for"
 )
 @pytest.mark.parametrize("mode", ["classic", "antialiased"])
-def test_a_gpu_gives_the_bits_of_the_cpu(serving: NvrtcBackend, mode: str) -> None:
+def test_gpu_images_equal_cpu_images(serving: NvrtcBackend, mode: str) -> None:
     options = RasterOptions(rasterize_mode=mode)
     instances = [Instance(cloud(7, count=2500, bands=1)), *everything()]
     on_gpu, on_cpu = (
@@ -150,7 +148,7 @@ def requests_of(
     ]
 
 
-def test_cameras_of_several_sizes_are_drawn_by_the_launches_of_one() -> None:
+def test_cameras_of_several_sizes_share_launches() -> None:
     launcher = TwinLauncher()
     serving = NvrtcBackend(launcher)
     requests = requests_of([(45, 37), (20, 50), (70, 16)], everything())
@@ -163,7 +161,7 @@ def test_cameras_of_several_sizes_are_drawn_by_the_launches_of_one() -> None:
             np.testing.assert_array_equal(one[name], other[name])
 
 
-def test_finished_images_are_those_of_the_pass(serving: NvrtcBackend) -> None:
+def test_finished_frames_match_the_raw_output(serving: NvrtcBackend) -> None:
     [request] = requests_of([(45, 37)], everything())
     [finished] = serving.frames([request], ["rgb", "depth", "instance"])
     output = serving.rasterize(request)
@@ -176,7 +174,7 @@ def test_finished_images_are_those_of_the_pass(serving: NvrtcBackend) -> None:
     np.testing.assert_array_equal(finished["instance"], output.instance.numpy())
 
 
-def test_bits_do_not_depend_on_the_order_of_blocks_and_threads(serving: NvrtcBackend) -> None:
+def test_images_do_not_depend_on_block_and_thread_order(serving: NvrtcBackend) -> None:
     backwards = NvrtcBackend(TwinLauncher(backwards=True))
     instances = [Instance(cloud(7, count=2500, bands=1)), *everything()]
     one, other = (draw(b, instances, RasterOptions(), np.zeros(3)) for b in (serving, backwards))
@@ -184,7 +182,7 @@ def test_bits_do_not_depend_on_the_order_of_blocks_and_threads(serving: NvrtcBac
         assert torch.equal(getattr(one, name), getattr(other, name))
 
 
-def test_sessions_share_the_background_and_keep_their_own_objects(serving: NvrtcBackend) -> None:
+def test_sessions_share_the_background(serving: NvrtcBackend) -> None:
     background = cloud(0)
     worlds = [[Instance(background), Instance(cloud(seed, bands=4), POSE, seed)] for seed in (3, 4)]
     requests = [requests_of([(45, 37)], world)[0] for world in worlds]
@@ -196,7 +194,7 @@ def test_sessions_share_the_background_and_keep_their_own_objects(serving: Nvrtc
 
 
 def sheet(depths: list[float], opacity: float, side: float) -> GaussianCloud:
-    """Gaussians behind one another, that cover the image for a large ``side``."""
+    """Gaussians one behind the other. A large ``side`` covers the image."""
     n = len(depths)
     return GaussianCloud(
         torch.tensor([[0.0, 0.0, depth] for depth in depths]),
@@ -207,7 +205,7 @@ def sheet(depths: list[float], opacity: float, side: float) -> GaussianCloud:
     )
 
 
-def test_the_first_of_two_at_one_depth_is_in_front(serving: NvrtcBackend) -> None:
+def test_equal_depths_keep_the_instance_order(serving: NvrtcBackend) -> None:
     worlds = [
         [Instance(sheet([5.0], 0.9, 2.0), None, k) for k in order] for order in ((1, 2), (2, 1))
     ]
@@ -215,25 +213,25 @@ def test_the_first_of_two_at_one_depth_is_in_front(serving: NvrtcBackend) -> Non
     assert [images["instance"][0, 19, 22] for images in found] == [1, 2]
 
 
-def test_a_frame_for_which_there_is_no_room_is_drawn_again(serving: NvrtcBackend) -> None:
+def test_a_frame_that_exceeds_its_buffers_is_redrawn(serving: NvrtcBackend) -> None:
     large = Instance(sheet(np.linspace(3, 9, 1100).tolist(), 0.02, 50.0))
     output = draw(serving, [large], RasterOptions(), np.zeros(3))
     assert serving._launcher.launches["blend"] > 1
     assert serving._memory.pair_capacity >= 2 * 1100 * 9
-    # The 456th would leave less than 1e-4 of the light.
+    # The 456th layer would reduce the transmittance below 1e-4.
     assert float(output.alpha[0, 19, 22]) == pytest.approx(1 - 0.98**455, abs=1e-5)
     drawn_once = draw(serving, [large], RasterOptions(), np.zeros(3))
     assert torch.equal(output.rgb, drawn_once.rgb)
 
 
-def test_nothing_to_draw_shows_the_background(serving: NvrtcBackend) -> None:
+def test_an_empty_scene_shows_the_background(serving: NvrtcBackend) -> None:
     options = RasterOptions(background=(0.1, 0.2, 0.3))
     output = rasterize([], np.eye(4)[None], K[None], 20, 10, options=options, backend=serving)
     assert output.rgb[0, 3, 4].tolist() == pytest.approx([0.1, 0.2, 0.3])
     assert float(output.alpha.max()) == 0
 
 
-def test_more_cameras_than_a_frame_has_are_drawn_in_several(
+def test_cameras_beyond_the_frame_limit_are_split(
     serving: NvrtcBackend, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     requests = requests_of([(16, 16), (20, 18), (16, 16)], everything())
@@ -246,7 +244,7 @@ def test_more_cameras_than_a_frame_has_are_drawn_in_several(
             np.testing.assert_array_equal(one["rgb"], other["rgb"])
 
 
-def test_small_images_of_many_worlds_are_drawn_together() -> None:
+def test_small_images_of_many_worlds_are_batched() -> None:
     launcher = TwinLauncher()
     street, car = Instance(cloud(0, bands=4)), Instance(cloud(3, bands=4), POSE, 3)
     poses = np.stack([np.stack([np.eye(4), POSE]), np.stack([np.eye(4), POSE @ POSE])])
@@ -268,7 +266,7 @@ def test_small_images_of_many_worlds_are_drawn_together() -> None:
         assert torch.equal(together.rgb[k], alone.rgb[0])
 
 
-def test_median_depth_and_class_are_of_the_gaussian_that_halves_the_light(
+def test_median_depth_and_class_come_from_the_median_gaussian(
     serving: NvrtcBackend,
 ) -> None:
     world = [
@@ -280,7 +278,7 @@ def test_median_depth_and_class_are_of_the_gaussian_that_halves_the_light(
     assert images["semantic"][0, 19, 22] == 9
 
 
-def test_classes_and_median_depths_are_those_of_the_other_backends(serving: NvrtcBackend) -> None:
+def test_classes_and_median_depths_match_other_backends(serving: NvrtcBackend) -> None:
     world = [
         Instance(cloud(0), semantic=4),
         Instance(cloud(1), transform_from([1.0, 0, 0], np.eye(4)[0]), 3, semantic=26),
@@ -301,7 +299,7 @@ def test_classes_and_median_depths_are_those_of_the_other_backends(serving: Nvrt
     assert given["semantic"].dtype == cpu["semantic"].dtype == np.uint8
 
 
-def test_gradients_are_refused_with_what_gives_them(serving: NvrtcBackend) -> None:
+def test_gradients_are_refused_with_an_alternative(serving: NvrtcBackend) -> None:
     trained = cloud(0)
     trained.means.requires_grad_()
     with pytest.raises(RenderError, match="--backend cuda"):
@@ -312,7 +310,7 @@ def test_gradients_are_refused_with_what_gives_them(serving: NvrtcBackend) -> No
     ("name", "exact", "low", "high"),
     [("exponential", lambda x: math.exp(-x), 0, 6), ("logarithm", math.log, 1, 260)],
 )
-def test_functions_of_the_kernels_are_exact_to_single_precision(
+def test_kernel_functions_have_single_precision(
     name: str, exact: Callable[[float], float], low: float, high: float
 ) -> None:
     values = [float(v) for v in np.linspace(low, high, 2000, dtype=np.float32)]
@@ -321,7 +319,7 @@ def test_functions_of_the_kernels_are_exact_to_single_precision(
     assert error < 3e-7
 
 
-def test_structures_have_the_sizes_of_the_source() -> None:
+def test_structures_match_the_kernel_source() -> None:
     sizes = (ctypes.c_uint32 * 4)()
     twin().sizes(sizes)
     types = (launcher.OBJECT, launcher.PLACEMENT, launcher.CAMERA, launcher.FRAME)
@@ -331,5 +329,5 @@ def test_structures_have_the_sizes_of_the_source() -> None:
 @pytest.mark.parametrize(
     ("tiles", "passes"), [(1, 1), (256, 1), (257, 2), (65_536, 2), (65_537, 3)]
 )
-def test_tiles_are_sorted_by_as_many_bits_as_they_have(tiles: int, passes: int) -> None:
+def test_sort_passes_depend_on_the_number_of_tiles(tiles: int, passes: int) -> None:
     assert tile_passes(tiles) == passes

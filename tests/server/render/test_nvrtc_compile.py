@@ -1,4 +1,4 @@
-"""NVRTC compiles the serving kernels for GPUs that are not there, and nothing spills."""
+"""NVRTC compiles the serving kernels without a GPU and without register spills."""
 
 from __future__ import annotations
 
@@ -25,20 +25,18 @@ needs_nvrtc = pytest.mark.skipif(bool(MISSING), reason=MISSING)
         for name in compiling.ARCHITECTURES
     ],
 )
-def test_every_kernel_compiles_and_none_spills(architecture: str) -> None:
+def test_every_kernel_compiles_without_spills(architecture: str) -> None:
     code, usages = compiling.compile_kernels(architecture)
     assert code[:4] == b"\x7fELF"
     assert set(usages) == set(compiling.KERNELS)
     assert {name: usage.spilled for name, usage in usages.items() if usage.spilled} == {}
     assert all(usage.stack == 0 for usage in usages.values())
-    # Two blocks of a multiprocessor at least: one works while the other waits.
+    # At least two blocks per multiprocessor, to hide latency.
     assert min(usage.occupancy(architecture) for usage in usages.values()) >= 0.25
 
 
 @needs_nvrtc
-def test_what_was_compiled_is_kept_by_source_and_architecture(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_compiled_kernels_are_cached(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[str] = []
 
     def compile_one(_: KernelSource, architecture: str) -> tuple[bytes, str]:
@@ -56,9 +54,7 @@ def test_what_was_compiled_is_kept_by_source_and_architecture(
 
 
 @needs_nvrtc
-def test_a_source_that_is_wrong_is_refused_in_the_words_of_the_compiler(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_compiler_errors_are_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     source = tmp_path / "serving.cu"
     source.write_text('extern "C" __global__ void blend() { nonsense; }', encoding="ascii")
     monkeypatch.setattr(compiling, "SOURCE", source)
@@ -66,12 +62,12 @@ def test_a_source_that_is_wrong_is_refused_in_the_words_of_the_compiler(
         compiling.compile_kernels("sm_90")
 
 
-def test_usage_that_leaves_half_of_the_threads_is_said() -> None:
+def test_occupancy_is_limited_by_registers() -> None:
     usage = Usage(registers=64, shared=12_288, stack=0, spilled=0)
     assert usage.occupancy("sm_90") == 0.5
 
 
-def test_a_machine_without_a_gpu_says_what_the_backend_needs() -> None:
+def test_missing_requirements_have_a_remedy() -> None:
     need = unmet_nvrtc_need()
     if need is None:
         pytest.skip("everything is here")

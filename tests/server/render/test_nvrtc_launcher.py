@@ -1,4 +1,4 @@
-"""How kernels are launched on a GPU: a stand-in for cuda-core takes down what it is given."""
+"""Kernel launches, recorded by a fake cuda-core."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from real2sim_server.service.engine import _loses_device
 
 @pytest.fixture
 def launches(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
-    """Arguments of cuda.core.launch, on a machine with one GPU."""
+    """Recorded arguments of cuda.core.launch on a fake GPU."""
     taken: list[tuple[Any, ...]] = []
     code = SimpleNamespace(get_kernel=lambda name: f"kernel {name}")
     core: Any = types.ModuleType("cuda.core")
@@ -43,7 +43,7 @@ def launches(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
     return taken
 
 
-def test_a_launch_names_stream_blocks_kernel_and_arguments(
+def test_a_launch_passes_stream_grid_kernel_and_arguments(
     launches: list[tuple[Any, ...]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     launcher = CudaLauncher()
@@ -53,7 +53,7 @@ def test_a_launch_names_stream_blocks_kernel_and_arguments(
         ("device", 0),
         ("default stream", (12, 256), "kernel blend", 0x7000, np.uint32(17)),
     ]
-    # The kernel takes an address of 64 bits and a number of 32.
+    # The kernel takes a 64-bit address and a 32-bit number.
     assert type(launches[1][3]) is int
     assert type(launches[1][4]) is np.uint32
     other = SimpleNamespace(cuda_stream=5)
@@ -62,7 +62,7 @@ def test_a_launch_names_stream_blocks_kernel_and_arguments(
     assert launches[2][0] == "stream 5"
 
 
-def test_images_are_copied_on_a_stream_of_their_own_and_waited_for_by_an_event(
+def test_images_are_copied_on_a_separate_stream(
     launches: list[tuple[Any, ...]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Event:
@@ -97,7 +97,7 @@ def test_images_are_copied_on_a_stream_of_their_own_and_waited_for_by_an_event(
     assert launches == [("waits",)] * 2
 
 
-def test_a_launch_that_fails_is_known_as_the_loss_of_the_device(
+def test_a_failed_launch_counts_as_a_lost_device(
     launches: list[tuple[Any, ...]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     launcher = CudaLauncher()

@@ -1,4 +1,4 @@
-"""Pictures whose pixels can be worked out by hand; drawn by the CPU and by the reference."""
+"""Images with pixels calculated by hand, for the CPU backend and the reference."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def random_cloud(seed: int, count: int = 120) -> GaussianCloud:
 
 
 def moved(cloud: GaussianCloud, T: np.ndarray) -> GaussianCloud:
-    """The cloud with means and quaternions moved; colours stay as they are."""
+    """The cloud with transformed means and quaternions, and unchanged colours."""
     quats = multiply_quaternions(matrix_to_quaternion(T[:3, :3]), cloud.quats.numpy())
     means = cloud.means.numpy() @ T[:3, :3].T + T[:3, 3]
     return GaussianCloud(
@@ -87,7 +87,7 @@ def look(
     )
 
 
-def test_alpha_of_one_gaussian_falls_off_as_the_formula_says(backend: str) -> None:
+def test_alpha_of_one_gaussian_matches_the_formula(backend: str) -> None:
     alpha = look([Instance(cloud_of((4.0, 0.7, (1, 0, 0))))], backend).alpha[0]
     variance = (FOCAL * 0.2 / 4) ** 2 + 0.3
     for offset in (0, 1, 3, 6):
@@ -96,7 +96,7 @@ def test_alpha_of_one_gaussian_falls_off_as_the_formula_says(backend: str) -> No
         assert float(alpha[CENTRE - offset, CENTRE]) == pytest.approx(expected, abs=2e-5)
 
 
-def test_contributions_below_one_level_are_dropped(backend: str) -> None:
+def test_contributions_below_1_255_are_dropped(backend: str) -> None:
     alpha = look([Instance(cloud_of((4.0, 0.7, (1, 0, 0))))], backend).alpha[0, CENTRE]
     variance = (FOCAL * 0.2 / 4) ** 2 + 0.3
     reach = math.sqrt(2 * variance * math.log(255 * 0.7))
@@ -104,7 +104,7 @@ def test_contributions_below_one_level_are_dropped(backend: str) -> None:
     assert float(alpha[CENTRE + math.ceil(reach)]) == 0
 
 
-def test_nearer_gaussian_is_blended_first_whatever_their_order(backend: str) -> None:
+def test_gaussians_are_blended_by_depth(backend: str) -> None:
     near, far = (3.0, 0.6, (1.0, 0.0, 0.0)), (6.0, 0.5, (0.0, 1.0, 0.0))
     for splats in ((near, far), (far, near)):
         out = look([Instance(cloud_of(*splats))], backend, background=(0, 0, 1))
@@ -119,10 +119,10 @@ def test_equal_depth_keeps_the_order_of_instances(backend: str) -> None:
         assert out.rgb[0, CENTRE, CENTRE].tolist() == pytest.approx(expected, abs=1e-5)
 
 
-def test_pixel_stops_before_transmittance_would_vanish(backend: str) -> None:
+def test_blending_stops_before_transmittance_falls_below_the_limit(backend: str) -> None:
     layers = [(2.0 + i, 0.999, (float(i == 0), float(i == 1), float(i == 2))) for i in range(3)]
     out = look([Instance(cloud_of(*layers))], backend)
-    # 1e-3 is left after the first layer; the second would leave 1e-6 and is not drawn.
+    # Transmittance is 1e-3 after the first layer. The second would leave 1e-6 and is not drawn.
     assert out.rgb[0, CENTRE, CENTRE].tolist() == pytest.approx([0.999, 0, 0], abs=1e-5)
     assert float(out.alpha[0, CENTRE, CENTRE]) == pytest.approx(0.999, abs=1e-5)
 
@@ -132,7 +132,7 @@ def test_alpha_is_capped(backend: str) -> None:
     assert float(out.alpha.max()) == pytest.approx(0.999, abs=1e-6)
 
 
-def test_depth_is_the_weighted_mean_and_zero_where_nothing_is(backend: str) -> None:
+def test_depth_is_the_weighted_mean_or_zero(backend: str) -> None:
     out = look([Instance(cloud_of((3.0, 0.6, (1, 0, 0)), (6.0, 0.5, (0, 1, 0))))], backend)
     assert out.depth is not None
     expected = (0.6 * 3 + 0.2 * 6) / 0.8
@@ -157,7 +157,7 @@ def test_depth_of_a_wall_is_its_distance_along_the_axis(backend: str) -> None:
     torch.testing.assert_close(out.depth, torch.full_like(out.depth, 5.0), rtol=0, atol=1e-4)
 
 
-def test_instance_is_the_one_at_which_transmittance_falls_to_half(backend: str) -> None:
+def test_instance_is_where_transmittance_falls_to_half(backend: str) -> None:
     thin, solid = cloud_of((3.0, 0.3, (1, 0, 0))), cloud_of((5.0, 0.9, (0, 1, 0)))
     out = look([Instance(thin, instance_id=2), Instance(solid, instance_id=9)], backend)
     assert out.instance is not None
@@ -168,7 +168,7 @@ def test_instance_is_the_one_at_which_transmittance_falls_to_half(backend: str) 
     assert int(alone.instance.int().max()) == 0
 
 
-def test_pose_of_an_object_equals_a_cloud_that_was_moved(backend: str) -> None:
+def test_an_object_pose_equals_a_moved_cloud(backend: str) -> None:
     cloud = random_cloud(0)
     flat = GaussianCloud(
         cloud.means, cloud.quats, cloud.scales, cloud.opacities, cloud.sh[:, :1].contiguous()
@@ -178,7 +178,7 @@ def test_pose_of_an_object_equals_a_cloud_that_was_moved(backend: str) -> None:
     torch.testing.assert_close(placed.rgb, baked.rgb, rtol=0, atol=1e-4)
 
 
-def test_turning_object_and_camera_together_changes_nothing(backend: str) -> None:
+def test_rotating_object_and_camera_together_changes_nothing(backend: str) -> None:
     cloud = random_cloud(1)
     start = transform_from([0, 0, 4.0], np.array([1.0, 0, 0, 0]))
     still = look([Instance(cloud, start)], backend)
@@ -186,7 +186,7 @@ def test_turning_object_and_camera_together_changes_nothing(backend: str) -> Non
     torch.testing.assert_close(turned.rgb, still.rgb, rtol=0, atol=1e-4)
 
 
-def test_colour_is_seen_in_the_frame_of_the_object(backend: str) -> None:
+def test_view_dependent_colour_uses_the_object_frame(backend: str) -> None:
     cloud = cloud_of((0.0, 0.9, (0.5, 0.5, 0.5))).with_sh_degree(1)
     sh = cloud.sh.clone()
     sh[:, 2, 0] = 1.0  # redder seen along +z of the object than along -z
@@ -200,7 +200,7 @@ def test_colour_is_seen_in_the_frame_of_the_object(backend: str) -> None:
     assert reds == pytest.approx([0.5 + 0.4886025, 0.5 - 0.4886025], abs=1e-4)
 
 
-def test_scale_equals_a_cloud_that_was_stretched(backend: str) -> None:
+def test_an_object_scale_equals_a_stretched_cloud(backend: str) -> None:
     cloud, scale = random_cloud(2), np.array([0.5, 1.5, 0.8])
     rotations = quaternion_to_matrix(cloud.quats.numpy())
     factor = scale[:, None] * rotations * cloud.scales.numpy()[:, None, :].astype(np.float64)
@@ -229,7 +229,7 @@ def test_covariances_replace_quaternions_and_scales(backend: str) -> None:
     torch.testing.assert_close(given.rgb, expected.rgb, rtol=0, atol=1e-4)
 
 
-def test_antialiased_keeps_the_light_of_a_small_gaussian(backend: str) -> None:
+def test_antialiasing_preserves_the_light_of_a_small_gaussian(backend: str) -> None:
     cloud = cloud_of((100.0, 0.9, (1, 1, 1)))
     sharp = (FOCAL * 0.2 / 100) ** 2
     classic = look([Instance(cloud)], backend).alpha[0, CENTRE, CENTRE]
@@ -239,20 +239,20 @@ def test_antialiased_keeps_the_light_of_a_small_gaussian(backend: str) -> None:
     assert float(compensated.alpha[0, CENTRE, CENTRE]) == pytest.approx(expected, abs=1e-4)
 
 
-def test_gaussians_outside_the_planes_are_not_drawn(backend: str) -> None:
+def test_gaussians_outside_the_clip_planes_are_not_drawn(backend: str) -> None:
     cloud = cloud_of((1.0, 0.9, (1, 1, 1)), (10.0, 0.9, (1, 1, 1)), (5.0, 0.4, (1, 1, 1)))
     out = look([Instance(cloud)], backend, near_plane=2.0, far_plane=8.0)
     assert float(out.alpha[0, CENTRE, CENTRE]) == pytest.approx(0.4, abs=1e-5)
 
 
-def test_radius_clip_drops_what_is_small_on_screen(backend: str) -> None:
+def test_radius_clip_drops_small_gaussians(backend: str) -> None:
     cloud = cloud_of((4.0, 0.9, (1, 1, 1)), (100.0, 0.9, (1, 1, 1)))
     far_only = cloud.select(torch.tensor([1]))
     assert float(look([Instance(far_only)], backend, radius_clip=4.0).alpha.max()) == 0
     assert float(look([Instance(cloud)], backend, radius_clip=4.0).alpha.max()) > 0.8
 
 
-def test_nothing_to_draw_gives_the_background(backend: str) -> None:
+def test_an_empty_scene_shows_the_background(backend: str) -> None:
     out = look([], backend, background=(0.1, 0.2, 0.3))
     assert out.rgb.shape == (1, SIZE, SIZE, 3)
     torch.testing.assert_close(out.rgb[0, 5, 7], torch.tensor([0.1, 0.2, 0.3]))
@@ -270,17 +270,17 @@ def test_sky_is_sampled_along_world_directions(backend: str) -> None:
         directions = torch.from_numpy(rays @ T_world_camera[:3, :3].T)
         expected = sky.sample(directions).float()
         difference = (out.rgb[0] - expected).abs().amax(-1)
-        # Faces are not blended into each other, so a ray along an edge may take either.
+        # Cube faces are not blended, so a ray at an edge may sample either.
         assert float((difference > 1e-4).float().mean()) < 0.01
 
 
-def test_sky_shows_through_by_what_is_left_of_the_light(backend: str) -> None:
+def test_sky_is_weighted_by_transmittance(backend: str) -> None:
     out = look([Instance(cloud_of((4.0, 0.7, (1, 0, 0))))], backend, sky=Sky.uniform((0, 0, 1)))
     assert out.rgb[0, CENTRE, CENTRE].tolist() == pytest.approx([0.7, 0, 0.3], abs=1e-5)
     assert out.rgb[0, 0, 0].tolist() == pytest.approx([0, 0, 1])
 
 
-def test_colours_are_those_of_the_instant(backend: str) -> None:
+def test_time_varying_colours_are_evaluated_at_the_instance_time(backend: str) -> None:
     cloud = random_cloud(8)
     coefficients = torch.randn(120, 3, 3, generator=torch.Generator().manual_seed(9)) * 0.3
     colour = TimeColour(coefficients, "cosine", 0, 1000)
@@ -291,7 +291,7 @@ def test_colours_are_those_of_the_instant(backend: str) -> None:
         assert torch.equal(shown.alpha, baked.alpha)
 
 
-def test_a_colour_that_does_not_fit_its_cloud_is_refused(backend: str) -> None:
+def test_invalid_time_colours_are_refused(backend: str) -> None:
     few = TimeColour(torch.zeros(3, 2, 3), "cosine", 0, 1000)
     with pytest.raises(RenderError, match=r"instances\[0\].colour has 3 rows for a cloud of 120"):
         look([Instance(random_cloud(8), TURN, colour=few)], backend)
@@ -300,7 +300,7 @@ def test_a_colour_that_does_not_fit_its_cloud_is_refused(backend: str) -> None:
         look([Instance(random_cloud(8), TURN, colour=broken)], backend)
 
 
-def test_images_that_are_no_multiple_of_a_tile_are_filled_to_the_edge(backend: str) -> None:
+def test_partial_tiles_are_filled_to_the_edge(backend: str) -> None:
     for width, height in ((1, 1), (17, 5), (16, 33)):
         out = rasterize(
             [],
@@ -317,7 +317,7 @@ def test_images_that_are_no_multiple_of_a_tile_are_filled_to_the_edge(backend: s
 
 def test_gradients_of_the_reference_match_finite_differences() -> None:
     cloud = random_cloud(4, count=6)
-    # So wide that no pixel crosses the cut at 1/255, where the picture has no gradient.
+    # Wide enough that no pixel crosses the cutoff at 1/255.
     cloud = replace(cloud, means=cloud.means * 0.4, scales=cloud.scales + 1.5)
 
     def light(means: torch.Tensor, opacities: torch.Tensor) -> torch.Tensor:

@@ -1,4 +1,4 @@
-"""What rasterize() refuses, and what it says."""
+"""Requests that rasterize() refuses, and their messages."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ CASES: dict[str, tuple[dict[str, Any], str]] = {
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_refused_with_a_reason(name: str) -> None:
+def test_invalid_requests_are_refused_with_a_reason(name: str) -> None:
     arguments: dict[str, Any] = {
         "instances": [],
         "viewmats": EYE,

@@ -1,4 +1,4 @@
-"""Which backend is chosen, and why."""
+"""Selection of the rendering backend."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def forget_choices() -> None:
     select_backend.cache_clear()
 
 
-def test_auto_takes_the_cpu_without_a_gpu_and_logs_why(
+def test_auto_selects_the_cpu_without_a_gpu_and_logs_why(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
@@ -25,12 +25,12 @@ def test_auto_takes_the_cpu_without_a_gpu_and_logs_why(
     assert "real2sim[server,cuda]" in caplog.text or "driver" in caplog.text
 
 
-def test_a_backend_is_made_once() -> None:
+def test_backends_are_cached() -> None:
     assert select_backend("cpu") is select_backend("cpu")
     assert select_backend("reference") is select_backend("reference")
 
 
-def test_backend_that_cannot_be_used_is_refused_with_the_remedy(
+def test_an_unusable_backend_is_refused(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
@@ -38,7 +38,7 @@ def test_backend_that_cannot_be_used_is_refused_with_the_remedy(
         select_backend("cuda")
 
 
-def test_every_backend_is_described_with_a_reason_and_a_remedy_where_needed() -> None:
+def test_unusable_backends_are_described_with_a_remedy() -> None:
     statuses = describe_backends()
     assert {status.name for status in statuses} == {"cuda", "cpu", "nvrtc", "reference"}
     for status in statuses:

@@ -1,4 +1,4 @@
-"""Images of uncertainty: means of what each pixel shows."""
+"""Uncertainty images: the blended mean of each pixel."""
 
 from __future__ import annotations
 
@@ -43,14 +43,14 @@ def drawn(*world: Instance, sky: Sky | None = None, backend: str = "cpu", **give
 
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
-def test_a_pixel_has_the_mean_of_what_it_shows_by_how_much(backend):
+def test_pixels_blend_uncertainty_by_weight(backend):
     image = drawn(ball(5, opacity=0.6, known=0.2), ball(8, known=0.04), backend=backend)
     assert (image.dtype, image.shape) == (np.float32, (40, 48))
     assert image[MIDDLE] == pytest.approx(0.6 * 0.2 + 0.4 * 0.04, abs=2e-3)
     assert image[CORNER] == pytest.approx(UNSEEN)
 
 
-def test_the_sky_has_its_own_and_is_unseen_where_none_is_known():
+def test_the_sky_has_its_uncertainty_or_counts_as_unseen():
     sky = Sky.uniform((0.5, 0.6, 0.9), resolution=4)
     assert drawn(ball(5), sky=sky)[CORNER] == pytest.approx(UNSEEN)
     known = replace(sky, uncertainties=torch.full((6, 4, 4), 0.02))
@@ -59,17 +59,17 @@ def test_the_sky_has_its_own_and_is_unseen_where_none_is_known():
     assert image[MIDDLE] == pytest.approx(0.1, abs=3e-3)
 
 
-def test_what_knows_none_counts_as_never_seen_beside_what_does():
+def test_clouds_without_uncertainty_count_as_unseen():
     image = drawn(ball(5, known=None), ball(500, known=0.01))
     assert image[MIDDLE] == pytest.approx(UNSEEN, abs=3e-3)
 
 
-def test_where_nothing_knows_any_it_is_refused_with_what_to_do():
+def test_scenes_without_uncertainty_are_refused():
     with pytest.raises(RenderError, match="real2sim fit-uncertainty SCENE LOG"):
         drawn(ball(5, known=None))
 
 
-def test_colours_and_depths_are_those_of_a_pass_without_it():
+def test_uncertainty_does_not_change_the_other_images():
     world = [ball(5, opacity=0.7), ball(8)]
     names = ["rgb", "depth", "instance"]
     options = {"sky": Sky.uniform((0.5, 0.6, 0.9)), "backend": "cpu"}
@@ -83,7 +83,7 @@ def test_colours_and_depths_are_those_of_a_pass_without_it():
     np.testing.assert_array_equal(alone, both.images["uncertainty"])
 
 
-def test_merged_gaussians_of_small_images_have_the_mean_of_theirs():
+def test_merged_gaussians_have_the_mean_uncertainty():
     rng = np.random.default_rng(3)
     count = 4_000
     means = np.stack([np.full(count, 30.0), *rng.uniform(-20, 20, (2, count))], axis=1)
@@ -103,7 +103,7 @@ def test_merged_gaussians_of_small_images_have_the_mean_of_theirs():
     assert full.mean() == pytest.approx(0.11, rel=0.1)
 
 
-def test_pngs_have_steps_of_a_65535th():
+def test_png_uncertainty_has_16_bits():
     import cv2
 
     image = np.linspace(0, 1, 12, dtype=np.float32).reshape(3, 4)
@@ -113,7 +113,7 @@ def test_pngs_have_steps_of_a_65535th():
     np.testing.assert_allclose(read / 65535, image, atol=0.5 / 65535)
 
 
-def test_the_picture_for_people_goes_from_black_to_pale():
+def test_the_colour_map_runs_from_dark_to_bright():
     picture = uncertainty_picture(np.array([[0.0, UNSEEN / 2, UNSEEN, 1.0]], np.float32))
     brightness = picture.sum(-1)[0]
     assert brightness[0] < 20 < brightness[1] < brightness[2] == brightness[3]

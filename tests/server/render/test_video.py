@@ -34,12 +34,12 @@ def test_frames_come_back_in_order_and_color(tmp_path, suffix):
     assert np.array(read) == pytest.approx(np.array([f[0, 0] for f in FRAMES]), abs=12)
 
 
-def test_nothing_is_said_on_standard_error(tmp_path, capfd):
+def test_writing_a_video_prints_nothing_to_stderr(tmp_path, capfd):
     write(tmp_path / "film.webm")
     assert capfd.readouterr().err == ""
 
 
-def test_a_webm_file_says_that_it_is_one(tmp_path):
+def test_webm_files_have_the_webm_doctype(tmp_path):
     write(tmp_path / "film.webm")
     header = (tmp_path / "film.webm").read_bytes()[:64]
     assert b"\x42\x82\x88webm\0" in header
@@ -52,7 +52,7 @@ def test_odd_sizes_lose_their_last_row_and_column(tmp_path):
     assert film.read()[1].shape == (48, 64, 3)
 
 
-def test_a_film_that_breaks_off_leaves_the_one_before(tmp_path):
+def test_a_failed_write_keeps_the_previous_file(tmp_path):
     write(tmp_path / "film.webm")
     before = (tmp_path / "film.webm").read_bytes()
     with pytest.raises(ValueError, match="unpack"):
@@ -66,7 +66,7 @@ def test_other_containers_are_refused(tmp_path):
         write(tmp_path / "film.avi")
 
 
-def test_a_frame_may_be_changed_once_it_is_added(tmp_path):
+def test_added_frames_can_be_modified(tmp_path):
     frame = np.full((48, 64, 3), 200, np.uint8)
     with video_file(tmp_path / "film.webm", frames_per_second=10.0) as video:
         for _ in range(40):
@@ -79,7 +79,7 @@ def test_a_frame_may_be_changed_once_it_is_added(tmp_path):
     assert min(image.mean() for more, image in read if more) > 180
 
 
-def test_a_frame_that_cannot_be_encoded_is_an_error_and_leaves_no_file(tmp_path):
+def test_an_invalid_frame_raises_and_leaves_no_file(tmp_path):
     frames = [FRAMES[0], np.zeros((48, 64, 3), np.complex128)]
     with pytest.raises(cv2.error):
         write(tmp_path / "film.webm", frames)
@@ -88,7 +88,7 @@ def test_a_frame_that_cannot_be_encoded_is_an_error_and_leaves_no_file(tmp_path)
 
 @contextlib.contextmanager
 def files_of_at_most(size):
-    """This process writes nothing behind that many bytes of a file, for the length of the block."""
+    """Limit file sizes of this process to ``size`` bytes within the block."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
     try:
@@ -98,14 +98,12 @@ def files_of_at_most(size):
 
 
 def refused(number):
-    """The block ends with this error of the system."""
+    """Expect an OSError with this errno."""
     return pytest.raises(OSError, match=rf"\[Errno {number}\]")
 
 
 @pytest.mark.parametrize("suffix", ["webm", "mp4"])
-def test_a_video_that_the_system_does_not_take_whole_is_an_error_and_leaves_no_file(
-    tmp_path, suffix
-):
+def test_an_incomplete_write_raises_and_leaves_no_file(tmp_path, suffix):
     noise = np.random.default_rng(0).integers(0, 255, (30, 96, 160, 3), np.uint8)
     path = tmp_path / f"film.{suffix}"
     write(path, noise)
@@ -119,12 +117,12 @@ def test_a_video_that_the_system_does_not_take_whole_is_an_error_and_leaves_no_f
         write(path, noise)
 
 
-def test_a_file_that_cannot_be_opened_is_refused_with_the_reason_of_the_system(tmp_path):
+def test_a_file_that_cannot_be_opened_raises_the_os_error(tmp_path):
     with refused(errno.ENAMETOOLONG):
         write(tmp_path / f"{'x' * 300}.webm")
 
 
-def test_a_format_that_opencv_cannot_write_is_refused_as_such(tmp_path, monkeypatch):
+def test_a_missing_opencv_encoder_is_refused(tmp_path, monkeypatch):
     monkeypatch.setitem(video_module.FOURCC_BY_SUFFIX, ".webm", "????")
     with pytest.raises(VideoError, match="encoder"):
         write(tmp_path / "film.webm")

@@ -1,4 +1,4 @@
-"""Exported corner cases pass ASAM's own checkers, the schema of version 1.3 among them."""
+"""Exported corner cases pass ASAM's own checkers, including the version 1.3 schema."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ qc_baselib = pytest.importorskip("qc_baselib", reason="asam-qc-baselib is not in
 
 
 def issues(path):
-    """What all checkers say, and how many of them have run to their end."""
+    """All issues found by the checkers, and how many checkers completed."""
     configuration, result = qc_baselib.Configuration(), qc_baselib.Result()
     configuration.set_config_param("InputFile", str(path))
     result.register_checker_bundle(
@@ -43,7 +43,7 @@ def test_an_exported_case_has_no_issues(tmp_path, name):
     assert "check_asam_xosc_xml_valid_schema" in done
 
 
-def test_the_checkers_see_what_is_wrong(tmp_path):
+def test_the_checkers_detect_errors(tmp_path):
     path = tmp_path / "broken.xosc"
     text = write_openscenario(corner_case("ccrb").storyboard()).decode()
     path.write_text(text.replace("<LongitudinalAction>", "<Longitudinal>"))

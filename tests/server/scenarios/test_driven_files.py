@@ -1,4 +1,4 @@
-"""``real2sim run FILE``: what is driven is what the file says."""
+"""``real2sim run FILE`` drives what the file describes."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def scenario(
 
 @dataclass(frozen=True)
 class Run:
-    """What a run has printed, and what it has left."""
+    """What a run has printed and written."""
 
     output: str
     exit_code: int
@@ -108,7 +108,7 @@ class Run:
         return [i.ego for i in self.recording.instants]
 
     def begins(self, event: str) -> list[float]:
-        """When an event has begun [s]."""
+        """When an event began [s]."""
         return [
             e["t"]
             for e in self.figures["events"]
@@ -158,7 +158,7 @@ def test_an_empty_start_trigger_starts_at_once_and_is_noted(run, element):
 
 
 @pytest.mark.parametrize("rate", [4.0, -4.0])
-def test_of_a_rate_the_magnitude_counts(run, rate):
+def test_only_the_magnitude_of_a_rate_counts(run, rate):
     how = f'dynamicsShape="linear" dynamicsDimension="rate" value="{rate}"'
     found = run(scenario(actor="Ego", action=speed(2.0, how)))
 
@@ -195,14 +195,14 @@ def test_a_route_outlasts_a_teleport_onto_it(run):
     assert (ego.x, ego.y) == (pytest.approx(150.0, abs=1.0), pytest.approx(46.5, abs=1.0))
 
 
-def test_an_ego_without_a_speed_stands(run):
+def test_an_ego_without_a_speed_stands_still(run):
     init = private("Ego", put(lane(-2, 50.0))) + TARGET
 
     assert max(abs(e.speed) for e in run(scenario(init=init)).ego) == 0.0
     assert run(scenario(init=init), planner="idm").ego[0].speed == 0.0
 
 
-def test_a_first_speed_that_takes_time_begins_at_none(run):
+def test_an_initial_speed_that_takes_time_starts_from_zero(run):
     how = 'dynamicsShape="linear" dynamicsDimension="time" value="4"'
     init = private("Ego", put(lane(-2, 50.0)), speed(8.0, how)) + TARGET
     found = run(scenario(init=init))
@@ -212,7 +212,7 @@ def test_a_first_speed_that_takes_time_begins_at_none(run):
     assert run(scenario(init=init), planner="idm").ego[0].speed == 0.0
 
 
-def test_the_ego_has_the_box_of_the_file(run):
+def test_the_ego_has_the_bounding_box_of_the_file(run):
     box = '<Center x="3.5" y="0" z="1.5"/><Dimensions width="2.5" length="12" height="3"/>'
     entities = vehicle("Ego", box) + vehicle("Target")
     init = EGO + private("Target", put(lane(-2, 110.0)), speed(0.0))
@@ -227,7 +227,7 @@ def test_the_ego_has_the_box_of_the_file(run):
     assert found.ego[0].x == pytest.approx(50.0 + 3.5 - 6.0 + 0.95)
 
 
-def test_an_ego_is_placed_relative_to_who_is_placed_later_in_the_file(run):
+def test_an_ego_can_be_placed_relative_to_a_later_entity(run):
     relative = put('<RelativeLanePosition entityRef="Target" dLane="-1" ds="-30"/>')
     found = run(scenario(init=private("Ego", relative, speed(10.0)) + TARGET), seconds=1.0)
 
@@ -267,7 +267,7 @@ def test_empty_declarations_below_the_top_level_change_nothing(run):
     assert run(text, seconds=1.0).figures == run(scenario(), seconds=1.0).figures
 
 
-def test_of_declarations_within_each_other_the_inner_name_wins(run):
+def test_nested_declarations_shadow_outer_ones(run):
     text = scenario(
         actor="Ego", action=speed("${$v / $share}"), inside_story=declared(v=4.0, share=2.0)
     )

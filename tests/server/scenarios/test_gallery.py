@@ -77,7 +77,7 @@ def test_each_case_has_a_definition():
     [*((name, {}) for name in GALLERY), *OTHER.items()],
     ids=[*GALLERY, *(f"{name}-other" for name in OTHER)],
 )
-def test_a_case_goes_by_its_formulas(scene, name, parameters):
+def test_a_case_follows_its_formulas(scene, name, parameters):
     case = corner_case(name)
     definition = DEFINITIONS[name](**{**case.parameters, **parameters})
     end = max(definition.starts.values(), default=0.0) + 3.5
@@ -99,7 +99,7 @@ def test_a_case_goes_by_its_formulas(scene, name, parameters):
             assert low - NEAR <= actor.speed <= high + NEAR, (entity, t)
 
 
-def test_the_ego_begins_to_leave_its_lane(scene):
+def test_the_ego_starts_to_leave_its_lane(scene):
     """The planner's ego is put where lane keeping begins."""
     board = with_speed(corner_case("lss_keep").storyboard())
     spec = ResetSpec(storyboard=fitted_to_scene(board, scene), horizon=20)
@@ -112,7 +112,7 @@ def test_the_ego_begins_to_leave_its_lane(scene):
 
 
 @pytest.mark.parametrize("name", GALLERY)
-def test_a_case_is_written_as_a_file_and_read_back_to_the_same_run(scene, name):
+def test_a_case_written_as_a_file_gives_the_same_run(scene, name):
     board = corner_case(name).storyboard()
     data = write_openscenario(board)
     again = read_openscenario_text(data, f"{name}.xosc").board

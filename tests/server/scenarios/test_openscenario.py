@@ -62,13 +62,13 @@ def test_broken_files_are_refused(text, message):
         read(text)
 
 
-def test_given_values_replace_those_of_the_file():
+def test_given_values_override_those_of_the_file():
     assert read(CASE, parameters={"braking": 3.0}).parameters["braking"] == 3.0
     with pytest.raises(ScenarioError, match="no parameter 'brakes'"):
         read(CASE, parameters={"brakes": 3.0})
 
 
-def test_derived_parameters_become_expressions_of_those_they_follow_from():
+def test_derived_parameters_become_expressions():
     text = CASE.replace(
         "</ParameterDeclarations>",
         '<ParameterDeclaration name="far" parameterType="double" value="${2 * $gap}" />'
@@ -107,7 +107,7 @@ def test_catalogs_and_distributions_are_read_from_their_folders(tmp_path):
     assert found.board.entities[0].model == "ego"
 
 
-def test_files_of_another_program_mean_the_same(tmp_path):
+def test_files_from_another_program_mean_the_same(tmp_path):
     """``scenariogeneration`` writes a lane change that takes 3 s from 1 s on."""
     xosc = pytest.importorskip("scenariogeneration.xosc", reason="needs scenariogeneration")
     box = xosc.BoundingBox(1.9, 4.5, 1.5, 1.35, 0, 0.75)

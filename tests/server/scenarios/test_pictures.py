@@ -18,7 +18,7 @@ def scene():
 
 
 @pytest.mark.parametrize("name", GALLERY)
-def test_the_picture_that_is_shipped_is_that_of_the_case(scene, name):
+def test_the_shipped_picture_matches_the_case(scene, name):
     """Made anew by ``python -m real2sim_server.scenarios.picture``."""
     assert shipped_picture(name).decode() == picture_of(GALLERY[name], scene)
 

@@ -1,4 +1,4 @@
-"""Small scenes to test with."""
+"""Small test scenes."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""Makes ncore_cameras.json: where NVIDIA's NCore sees points through its camera models.
+"""Generate ncore_cameras.json: points projected with the camera models of NVIDIA's NCore.
 
-Needs ``nvidia-ncore`` (19.8.3, Apache-2.0), which the project does not install:
-``python make_ncore_cameras.py ncore_cameras.json [points]``. Numbers are float64, in NCore's image
-coordinates, which are ours: pixel centres at +0.5.
+Requires ``nvidia-ncore`` (19.8.3, Apache-2.0), which is not a dependency of the project. Usage:
+``python make_ncore_cameras.py ncore_cameras.json [points]``. Numbers are float64. Image coordinates
+have pixel centres at +0.5, as in this project.
 """
 
 import functools
@@ -31,7 +31,7 @@ def f32(*values):
 
 def models(shutter):
     common = {"resolution": SIZE, "shutter_type": shutter, "external_distortion_parameters": None}
-    # What the other polynomial starts Newton's method from; fitted so that three steps suffice.
+    # Fitted inverse polynomial, the initial value of Newton's method.
     angle = np.linspace(0, 1.9, 400)
     forward = [0.0, 560.0, 4.0, -9.0, 2.0, -0.3]
     radius = np.polynomial.polynomial.polyval(angle, forward)
@@ -83,7 +83,7 @@ def values(given):
 def sees(parameters, points, start, end):
     kind = sensors.CameraModel.from_parameters
     if isinstance(parameters, data.FThetaCameraModelParameters):
-        # Three steps of Newton, the default, are not enough near the end of the field.
+        # The default of three Newton steps is not enough near the edge of the field of view.
         kind = functools.partial(sensors.FThetaCameraModel, newton_iterations=20)
     model = kind(parameters, device="cpu", dtype=torch.float64)
     seen = model.world_points_to_image_points_shutter_pose(

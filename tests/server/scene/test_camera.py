@@ -19,7 +19,7 @@ def project(camera: Camera, T_world_vehicle: np.ndarray, point: list[float]) -> 
     return np.array([*(camera.K @ [x / z, y / z, 1])[:2], z])
 
 
-def test_a_point_ahead_lands_in_the_middle():
+def test_a_point_ahead_projects_to_the_image_centre():
     np.testing.assert_allclose(project(front(), np.eye(4), [11, 0, 1.5]), [320, 240, 10])
 
 
@@ -28,7 +28,7 @@ def test_left_and_up_in_the_world_are_left_and_up_in_the_image():
     np.testing.assert_allclose([column, row], [270, 190])
 
 
-def test_view_follows_the_vehicle():
+def test_the_view_follows_the_vehicle():
     T_world_vehicle = transform_from([5.0, 5, 0], yaw_quaternion(np.pi / 2))
     np.testing.assert_allclose(project(front(), T_world_vehicle, [5, 16, 1.5]), [320, 240, 10])
 
@@ -70,11 +70,11 @@ def test_a_rig_finds_cameras_by_name_and_keeps_their_order():
     assert len(rig) == 2
 
 
-def test_an_unknown_camera_is_answered_with_those_there_are():
+def test_an_unknown_camera_is_refused_with_the_known_ones():
     with pytest.raises(SceneError, match=r"unknown camera 'x'.*'front'"):
         CameraRig((front(),))["x"]
 
 
-def test_two_cameras_of_one_name_are_refused():
+def test_duplicate_camera_names_are_refused():
     with pytest.raises(SceneError, match="unique"):
         CameraRig((front(), front()))

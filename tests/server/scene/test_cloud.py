@@ -29,7 +29,7 @@ def test_degree_follows_from_the_number_of_coefficients(make_cloud, degree):
         ({"means": torch.zeros(50, 3, dtype=torch.float64)}, "float32"),
     ],
 )
-def test_tensors_that_do_not_fit_are_refused(make_cloud, change, reason):
+def test_tensors_with_a_wrong_shape_or_dtype_are_refused(make_cloud, change, reason):
     with pytest.raises(SceneError, match=reason):
         replace(make_cloud(), **change)
 
@@ -49,7 +49,7 @@ def test_a_tensor_on_another_device_is_refused(make_cloud):
         ("quats", 2.0, "unit length"),
     ],
 )
-def test_values_out_of_range_are_found_and_counted(make_cloud, field, value, reason):
+def test_invalid_values_are_reported_with_their_count(make_cloud, field, value, reason):
     cloud = make_cloud()
     cloud.check_values("cloud")
     getattr(cloud, field)[13] = value
@@ -78,7 +78,7 @@ def test_concatenation_of_nothing_is_empty():
     assert len(GaussianCloud.concatenate([])) == 0
 
 
-def test_harmonics_are_cut_to_a_lower_degree(make_cloud):
+def test_harmonics_are_truncated_to_a_lower_degree(make_cloud):
     cloud = make_cloud(degree=3)
     assert torch.equal(cloud.with_sh_degree(1).sh, cloud.sh[:, :4])
 
@@ -88,7 +88,7 @@ def colours(cloud: GaussianCloud, directions: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_a_moved_cloud_looks_the_same_from_the_moved_side(make_cloud, degree):
+def test_moving_a_cloud_rotates_its_view_dependent_colour(make_cloud, degree):
     cloud = make_cloud(20, degree=degree)
     transform = transform_from([3.0, -2, 1], np.array([0.5, -0.1, 0.7, 0.4]))
     directions = np.random.default_rng(3).normal(size=(30, 3))
@@ -104,7 +104,7 @@ def covariances(cloud: GaussianCloud) -> np.ndarray:
     return half @ half.transpose(0, 2, 1)
 
 
-def test_moving_takes_positions_and_covariances_along(make_cloud):
+def test_moving_transforms_means_and_covariances(make_cloud):
     cloud = make_cloud()
     transform = transform_from([3.0, -2, 1], np.array([0.5, -0.1, 0.7, 0.4]))
     moved = cloud.moved(transform, scale=2.0)
@@ -118,7 +118,7 @@ def test_moving_takes_positions_and_covariances_along(make_cloud):
     moved.check_values("moved")
 
 
-def test_moving_nowhere_changes_no_bit(make_cloud):
+def test_moving_by_the_identity_is_exact(make_cloud):
     cloud = make_cloud(degree=3)
     same = cloud.moved(np.eye(4))
     for name in ("means", "quats", "scales", "opacities", "sh"):
@@ -126,12 +126,12 @@ def test_moving_nowhere_changes_no_bit(make_cloud):
 
 
 @pytest.mark.parametrize("scale", [0.0, -1.0, float("nan")])
-def test_moving_with_a_scale_that_is_not_positive_is_refused(make_cloud, scale):
+def test_moving_with_a_non_positive_scale_is_refused(make_cloud, scale):
     with pytest.raises(SceneError, match="positive"):
         make_cloud().moved(np.eye(4), scale=scale)
 
 
-def test_moving_by_what_is_not_rigid_is_refused(make_cloud):
+def test_moving_by_a_non_rigid_transform_is_refused(make_cloud):
     with pytest.raises(SceneError, match="rigid"):
         make_cloud().moved(np.diag([1.0, 2, 1, 1]))
 
@@ -140,7 +140,7 @@ def with_uncertainties(cloud: GaussianCloud) -> GaussianCloud:
     return replace(cloud, uncertainties=torch.linspace(0, 1, len(cloud)))
 
 
-def test_uncertainties_go_with_their_gaussians(make_cloud):
+def test_uncertainties_follow_their_gaussians(make_cloud):
     cloud = with_uncertainties(make_cloud(9))
     picked = torch.tensor([7, 2, 2])
     assert torch.equal(cloud.select(picked).uncertainties, cloud.uncertainties[picked])
@@ -151,7 +151,7 @@ def test_uncertainties_go_with_their_gaussians(make_cloud):
     assert cloud.nbytes == make_cloud(9).nbytes + 9 * 4
 
 
-def test_what_is_joined_without_uncertainties_counts_as_never_seen(make_cloud):
+def test_concatenation_fills_missing_uncertainties_as_unseen(make_cloud):
     known, unknown = with_uncertainties(make_cloud(3)), make_cloud(2)
     joined = GaussianCloud.concatenate([known, unknown])
     assert joined.uncertainties.tolist() == [0, 0.5, 1, UNSEEN, UNSEEN]
@@ -159,7 +159,7 @@ def test_what_is_joined_without_uncertainties_counts_as_never_seen(make_cloud):
 
 
 @pytest.mark.parametrize("value", [-0.1, 1.5, float("nan")])
-def test_uncertainties_out_of_range_are_found(make_cloud, value):
+def test_uncertainties_out_of_range_are_reported(make_cloud, value):
     bad = replace(make_cloud(4), uncertainties=torch.tensor([0, 0, 1, value]))
     with pytest.raises(SceneError, match="1 of 4 values: uncertainties"):
         bad.check_values("x")

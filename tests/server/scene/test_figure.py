@@ -1,4 +1,4 @@
-"""People of a scene: Gaussians that follow a walking body, in bundles and out of them."""
+"""People: Gaussians skinned to a walking body, and their storage."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def person(asset, trajectory, object_id="anna"):
     return SceneObject(object_id, "pedestrian", size, asset.cloud, trajectory, figure=asset.figure)
 
 
-def test_gaussians_are_skinned_as_the_body_is(woman):
+def test_gaussians_are_skinned_with_the_body(woman):
     trajectory = walk(woman, 1.3)
     figure, t_us = woman.figure, 2_400_000
     posed = figure.posed(woman.cloud, trajectory, t_us)
@@ -56,7 +56,7 @@ def test_gaussians_are_skinned_as_the_body_is(woman):
     blended = (chosen * figure.weights.double().numpy()[..., None, None]).sum(axis=1)
     means = (blended[..., :3] @ rest[..., None])[..., 0] + blended[..., 3]
     np.testing.assert_allclose(posed.means, means - [0, 0, figure.middle], atol=1e-4)
-    # What one joint moves is turned as that joint.
+    # Gaussians bound to one joint rotate with it.
     alone = figure.weights[:, 0].numpy() > 0.999
     turned = quaternion_to_matrix(posed.quats.double().numpy()[alone])
     before = quaternion_to_matrix(woman.cloud.quats.double().numpy()[alone])
@@ -67,8 +67,8 @@ def test_gaussians_are_skinned_as_the_body_is(woman):
 
 
 @pytest.mark.parametrize("speed", [0.7, 1.4, 2.2, 3.2])
-def test_feet_stand_still_in_the_world_at_any_speed(woman, speed):
-    """Where a sole is on the ground it is slower than 5 cm/s, between tabulated poses too."""
+def test_standing_feet_do_not_slide_at_any_speed(woman, speed):
+    """A sole on the ground moves at less than 5 cm/s, also between tabulated poses."""
     trajectory = walk(woman, speed)
     figure = woman.figure
     slow = 0
@@ -86,7 +86,7 @@ def test_feet_stand_still_in_the_world_at_any_speed(woman, speed):
         speeds = np.linalg.norm(np.diff(places[:, :2], axis=0), axis=1) / 0.01
         height = places[:-1, 2]
         standing = height < height.min() + 0.004
-        # The first and the last moment of a stance are those of landing and leaving.
+        # Exclude touchdown and lift-off at both ends of the stance.
         inside = standing & np.roll(standing, 2) & np.roll(standing, -2)
         slow += inside.sum()
         assert np.percentile(speeds[inside], 95) < 0.05
@@ -94,8 +94,8 @@ def test_feet_stand_still_in_the_world_at_any_speed(woman, speed):
 
 
 @pytest.mark.parametrize("speed", [0.7, 1.4, 2.2])
-def test_striding_is_walking_straight_on(woman, speed):
-    """As along a path at an even speed, of which the path makes whole steps between halts."""
+def test_striding_matches_walking_straight(woman, speed):
+    """Striding at constant speed matches walking along a straight path."""
     trajectory = walk(woman, speed, yaw=0.0)
     for t_us in (2_000_000, 2_210_000, 2_630_000):
         stride = woman.figure.stride_at(trajectory, t_us)
@@ -107,7 +107,7 @@ def test_striding_is_walking_straight_on(woman, speed):
 
 
 @pytest.mark.parametrize("speed", [0.9, 1.4, 3.0])
-def test_feet_of_who_is_driven_stand_still_at_an_even_speed(woman, speed):
+def test_striding_feet_do_not_slide_at_constant_speed(woman, speed):
     figure, stride = woman.figure, Stride(0.0, speed)
     own = (figure.joints[:, 0] == JOINTS.index("ball_l")) & (figure.weights[:, 0] > 0.95)
     places = []
@@ -123,7 +123,7 @@ def test_feet_of_who_is_driven_stand_still_at_an_even_speed(woman, speed):
     assert np.percentile(speeds[inside], 90) < 0.1
 
 
-def test_who_halts_comes_to_stand(woman):
+def test_a_halting_person_comes_to_a_standing_pose(woman):
     figure, stride = woman.figure, Stride(7.3, 1.4)
     for _ in range(40):
         stride = figure.strode(stride, speed=0.0, seconds=0.1)
@@ -132,8 +132,8 @@ def test_who_halts_comes_to_stand(woman):
     assert float((found - figure.posed(woman.cloud, here, 0).means).abs().max()) < 0.02
 
 
-def test_the_same_way_at_another_speed_takes_as_many_steps(woman):
-    """Steps hang on the distance, nearly: strides grow with speed."""
+def test_the_step_count_hardly_depends_on_speed(woman):
+    """The number of steps depends mostly on distance, since stride length grows with speed."""
 
     def lifted(speed):
         trajectory = walk(woman, speed, seconds=6.0 / speed)
@@ -150,7 +150,7 @@ def test_the_same_way_at_another_speed_takes_as_many_steps(woman):
     assert 0 <= lifted(1.0) - lifted(1.6) <= 2
 
 
-def test_an_instant_is_made_once_and_told_again_the_same(woman):
+def test_posed_clouds_are_cached_and_reproducible(woman):
     trajectory = walk(woman, 1.4)
     item = person(woman, trajectory)
     first = item.cloud_at(1_234_567)
@@ -160,7 +160,7 @@ def test_an_instant_is_made_once_and_told_again_the_same(woman):
     assert not torch.equal(item.cloud_at(1_300_000).means, first.means)
 
 
-def test_who_stands_has_the_feet_on_the_ground_and_arms_down(woman):
+def test_a_standing_person_has_feet_on_the_ground_and_arms_down(woman):
     here = Trajectory(np.array([0]), np.array([[3.0, 0, woman.figure.middle]]), np.eye(4)[:1])
     posed = person(woman, here).cloud_at(0)
     assert abs(float(posed.means[:, 2].min()) + woman.figure.middle) < 0.02
@@ -170,7 +170,7 @@ def test_who_stands_has_the_feet_on_the_ground_and_arms_down(woman):
     assert keypoints[0, 2] > keypoints[5, 2] > keypoints[11, 2] > keypoints[15, 2]
 
 
-def test_figures_must_fit(woman, make_cloud):
+def test_invalid_figures_are_refused(woman, make_cloud):
     trajectory = walk(woman, 1.0)
     with pytest.raises(SceneError, match="1500 rows for 7 Gaussians"):
         SceneObject("a", "pedestrian", woman.size, make_cloud(7), trajectory, figure=woman.figure)
@@ -213,7 +213,7 @@ def test_assets_keep_figures(woman, tmp_path):
     assert read_asset_summary(tmp_path / "a.r2a").nbytes == woman.nbytes
 
 
-def test_joints_that_a_body_lacks_are_refused(woman, tmp_path):
+def test_invalid_joints_and_heights_in_assets_are_refused(woman, tmp_path):
     strange = replace(woman, figure=replace(woman.figure, joints=woman.figure.joints + 22))
     with pytest.raises(SceneError, match="joint"):
         save_asset(strange, tmp_path / "a.r2a")
@@ -232,7 +232,7 @@ def test_packed_scenes_keep_figures(scene, woman, tmp_path):
     write_packed(peopled, tmp_path / "a.r2s.zip")
     read = read_packed(tmp_path / "a.r2s.zip").object("anna")
     shown, expected = (o.cloud_at(2_000_000).means for o in (read, peopled.object("anna")))
-    # Gaussians come back in another order.
+    # Packing reorders Gaussians.
     assert len(shown) == len(expected)
     nearest = torch.cdist(shown, expected).min(dim=1).values
     assert float(nearest.max()) < 1e-3

@@ -1,4 +1,4 @@
-"""The ground of a scene: what it answers, and how it is fitted."""
+"""The ground of a scene: queries and fitting."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def box(x: float, y: float, bottom: float) -> SimpleNamespace:
     return SimpleNamespace(size=(4.0, 2.0, 1.5), trajectory=track)
 
 
-# --- what it answers ---------------------------------------------------------------------------
+# --- queries -----------------------------------------------------------------------------------
 
 
 def test_heights_are_bilinear_between_the_centres_of_cells():
@@ -63,14 +63,14 @@ def test_heights_are_bilinear_between_the_centres_of_cells():
     np.testing.assert_allclose(ground.height_at(at), [0, 5, 2, 0.5])
 
 
-def test_outside_the_grid_the_nearest_place_of_its_rim_counts():
+def test_heights_are_clamped_outside_the_grid():
     ground = Ground(np.zeros(2), 1.0, np.array([[0, 1], [2, 5]]), np.ones((2, 2)))
 
     far = np.array([[-90.0, -90.0], [90.0, 90.0], [90.0, 1.0]])
     np.testing.assert_allclose(ground.height_at(far), [0, 5, 3.5])
 
 
-def test_one_place_and_many_get_the_same_bits():
+def test_single_and_batched_queries_agree_exactly():
     rng = np.random.default_rng(0)
     ground = Ground(np.zeros(2), 0.25, rng.normal(size=(90, 70)), np.ones((90, 70)))
     places = rng.uniform(-5, 30, (200, 2))
@@ -82,7 +82,7 @@ def test_one_place_and_many_get_the_same_bits():
 
 
 @pytest.mark.parametrize("yaw", [-3.0, -1.2, 0.0, 0.7, 2.5])
-def test_a_vehicle_stands_upright_on_a_slope_with_its_heading(yaw):
+def test_pose_on_a_slope_follows_normal_and_heading(yaw):
     trajectory = slope(pitch=0.15, roll=-0.1)
     T = driven_ground(trajectory).pose_on(12.0, 3.0, yaw)
 
@@ -92,7 +92,7 @@ def test_a_vehicle_stands_upright_on_a_slope_with_its_heading(yaw):
     assert math.atan2(T[1, 0], T[0, 0]) == pytest.approx(yaw)
 
 
-def test_normals_lean_as_the_ground_rises():
+def test_normals_follow_the_slope():
     trajectory = slope(pitch=0.1, roll=0.05)
     normals = driven_ground(trajectory).normal_at([[10.0, 0.0], [20.0, 4.0]])
 
@@ -109,7 +109,7 @@ def test_normals_lean_as_the_ground_rises():
         {"origin": np.zeros(3)},
     ],
 )
-def test_what_is_no_grid_is_refused(change):
+def test_invalid_grids_are_refused(change):
     given = {"origin": np.zeros(2), "cell": 1.0, "heights": np.zeros((4, 4))}
     with pytest.raises(SceneError, match="ground"):
         Ground(**({"is_ground": np.ones((4, 4))} | given | change))
@@ -119,7 +119,7 @@ def test_what_is_no_grid_is_refused(change):
 
 
 @pytest.mark.parametrize(("x", "y"), [(10.0, 0.0), (5.0, 4.0), (20.0, -6.0)])
-def test_beside_the_path_it_is_the_plane_the_recorder_stood_on(x, y):
+def test_the_ground_beside_the_path_extends_the_vehicle_plane(x, y):
     trajectory = slope(pitch=0.1, roll=0.05)
     normal = trajectory.transform(0)[:3, 2]
     expected = -(normal[0] * x + normal[1] * y) / normal[2]
@@ -127,7 +127,7 @@ def test_beside_the_path_it_is_the_plane_the_recorder_stood_on(x, y):
     assert driven_ground(trajectory).height(x, y) == pytest.approx(expected, abs=1e-3)
 
 
-def test_on_the_path_a_vehicle_stands_as_recorded():
+def test_poses_on_the_path_match_the_recording():
     trajectory = slope(pitch=0.15, roll=-0.1)
     recorded = trajectory.transform(1_000_000)
     x, y = recorded[:2, 3].tolist()
@@ -143,7 +143,7 @@ def test_far_from_the_path_the_plane_is_not_extended():
     assert ground.height(10.0, 50.0) == pytest.approx(ground.height(10.0, 12.0), abs=0.02)
 
 
-def test_boxes_tell_of_a_raised_pavement_beside_the_road():
+def test_boxes_reveal_a_raised_pavement():
     kerb = [box(x, 6.0, 0.15) for x in (10, 15, 20, 25)]
     ground = fit_scene_ground(NOTHING, straight(), kerb)
 
@@ -151,13 +151,13 @@ def test_boxes_tell_of_a_raised_pavement_beside_the_road():
     assert 0.1 < ground.height(17.0, 6.5) < 0.16
 
 
-def test_a_box_that_hangs_in_the_air_tells_nothing():
+def test_floating_boxes_are_ignored():
     ground = fit_scene_ground(NOTHING, straight(), [box(20, 4, 3.0)])
 
     assert ground.height(20.0, 4.0) == pytest.approx(0, abs=1e-6)
 
 
-def test_a_vehicle_that_never_moved_has_ground_all_around():
+def test_a_stationary_vehicle_has_level_ground():
     standing = Trajectory(np.array([0]), np.array([[3.0, 4.0, 0.5]]), yaw_quaternion(0.0)[None])
 
     np.testing.assert_allclose(driven_ground(standing).height_at([[3, 4], [40, -30]]), 0.5)
@@ -171,7 +171,7 @@ def tilted(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def street(seed: int = 0) -> np.ndarray:
-    """A tilted road with noise, a wall beside it, and reflections far below it."""
+    """Points of a tilted road with noise, a wall beside it and reflections below it."""
     rng = np.random.default_rng(seed)
     x, y = rng.uniform(-15, 55, 100_000), rng.uniform(-12, 12, 100_000)
     road = np.stack([x, y, tilted(x, y) + rng.normal(0, 0.01, x.size)], axis=1)
@@ -181,21 +181,21 @@ def street(seed: int = 0) -> np.ndarray:
 
 
 @pytest.mark.parametrize("place", [2e29, -1.1e6])
-def test_a_path_at_the_end_of_the_world_is_refused(tiny_scene, place):
+def test_a_path_far_from_the_origin_is_refused(tiny_scene, place):
     positions = np.array([[place, 0.0, 0.0]] * 2)
     ego = Trajectory(np.array([0, 1]), positions, np.array([[1.0, 0, 0, 0]] * 2))
     with pytest.raises(SceneError, match="from the origin"):
         fit_scene_ground(tiny_scene.background, ego, ())
 
 
-def test_heights_follow_the_road_in_spite_of_walls_and_reflections():
+def test_heights_follow_the_road_despite_walls_and_reflections():
     surface = fit_ground(street(), DrivenPath.of(straight()), NO_BOXES).surface
     xy = np.stack(np.meshgrid(np.arange(-10, 50, 0.5), np.arange(-8, 8, 0.5)), -1).reshape(-1, 2)
     np.testing.assert_allclose(surface.height_at(xy), tilted(*xy.T), atol=0.03)
     assert surface.covers(xy).all()
 
 
-def test_the_road_goes_on_under_a_box_that_hides_it():
+def test_the_road_continues_under_an_occluding_box():
     points = street()
     hidden = (np.abs(points[:, 0] - 12) < 3) & (np.abs(points[:, 1] + 4) < 1.5)
     corners = np.array([[9.0, -5.5], [15, -5.5], [15, -2.5], [9, -2.5]])
@@ -207,7 +207,7 @@ def test_the_road_goes_on_under_a_box_that_hides_it():
     np.testing.assert_allclose(surface.height_at(xy), tilted(*xy.T), atol=0.05)
 
 
-def test_the_ground_meets_the_recorded_path_and_keeps_its_shape_beside_it():
+def test_the_ground_is_shifted_to_the_path_only_near_it():
     ego = straight(bias=0.06)
     fit = fit_ground(street(), DrivenPath.of(ego), NO_BOXES)
     on_path = ego.positions[:, :2]
@@ -217,7 +217,7 @@ def test_the_ground_meets_the_recorded_path_and_keeps_its_shape_beside_it():
     np.testing.assert_allclose(fit.ground.height_at(aside), fit.surface.height_at(aside))
 
 
-def test_the_same_points_give_the_same_bits():
+def test_fitting_is_reproducible():
     path = DrivenPath.of(straight())
     a, b = (fit_ground(street(), path, NO_BOXES).ground for _ in range(2))
     assert np.array_equal(a.heights, b.heights)
@@ -237,7 +237,7 @@ def littered(clutter: float) -> np.ndarray:
     return np.column_stack([xy, z])
 
 
-def test_the_plane_is_that_of_the_road_and_not_of_what_stands_on_it():
+def test_the_plane_fits_the_road_despite_clutter():
     cloud = littered(0.4)
     plane = find_road_plane(cloud, BOXES)
     normal = np.array([-0.04, 0.02, 1.0]) / np.linalg.norm([-0.04, 0.02, 1.0])
@@ -249,27 +249,27 @@ def test_the_plane_is_that_of_the_road_and_not_of_what_stands_on_it():
     assert (plane.inliers == on_road).mean() > 0.999
 
 
-def test_only_points_around_the_boxes_are_looked_at():
+def test_only_points_around_the_boxes_are_candidates():
     cloud = littered(0.1)
     plane = find_road_plane(cloud, BOXES[:1])
     assert np.abs(cloud[plane.candidates, 0]).max() < 2.25 + 2.5 + 1e-9
 
 
-def test_nothing_under_the_boxes_is_refused():
+def test_a_plane_without_points_or_boxes_is_refused():
     with pytest.raises(SceneError, match="0 of 5 points"):
         find_road_plane(np.full((5, 3), 500.0), BOXES)
     with pytest.raises(SceneError, match="at least one"):
         find_road_plane(littered(0.1), [])
 
 
-def test_the_fit_begins_at_the_planes_found_below_the_path():
+def test_road_under_finds_planes_below_the_path():
     found = road_under(street(), DrivenPath.of(straight(bias=0.1)))
 
     np.testing.assert_allclose(found.points[:, 2], tilted(*found.points[:, :2].T), atol=0.01)
     np.testing.assert_allclose(found.driven, 0.1)
 
 
-def test_walls_among_gaussians_tell_nothing():
+def test_upright_gaussians_are_ignored():
     points = street()[:100_000]
     x = np.linspace(0, 40, 4000)
     wall = np.stack([x, np.full(4000, 5.0), np.tile(np.linspace(0.15, 0.5, 40), 100)], axis=1)
@@ -293,11 +293,11 @@ def test_walls_among_gaussians_tell_nothing():
 # --- of a scene --------------------------------------------------------------------------------
 
 
-def test_a_scene_fits_its_ground_once_and_hands_it_to_its_copies(tiny_scene):
+def test_a_scene_shares_its_fitted_ground_with_copies(tiny_scene):
     assert tiny_scene.ground is tiny_scene.ground
     assert tiny_scene.to("cpu").ground is tiny_scene.ground
 
 
-def test_a_stored_ground_is_the_one_that_is_told(tiny_scene):
+def test_a_stored_ground_takes_precedence(tiny_scene):
     stored = Ground.level(3.0)
     assert replace(tiny_scene, stored_ground=stored).ground is stored

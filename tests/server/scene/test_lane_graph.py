@@ -1,4 +1,4 @@
-"""Lanes of a scene: places in lanes and back, routes, the surface of the road."""
+"""Lane graphs: positions in lanes, routes and the road surface."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def bend(radius=30.0, count=60):
 
 
 @pytest.mark.parametrize("offset", [-1.5, 0.0, 1.2])
-def test_a_place_in_a_lane_is_found_where_it_was_put(offset):
+def test_nearest_inverts_a_position_in_a_lane(offset):
     lane = bend()
     graph = LaneGraph.of([lane])
     for s in (1.0, 17.3, 58.0):
@@ -51,7 +51,7 @@ def test_a_place_in_a_lane_is_found_where_it_was_put(offset):
         assert found.inside
 
 
-def test_the_nearest_lane_is_that_of_a_search_through_all_segments():
+def test_nearest_matches_a_brute_force_search():
     rng = np.random.default_rng(3)
     lanes = []
     for i in range(40):
@@ -71,27 +71,27 @@ def test_the_nearest_lane_is_that_of_a_search_through_all_segments():
         assert index >= 0
 
 
-def test_a_heading_tells_lanes_of_both_directions_apart(street):
+def test_heading_selects_between_opposite_lanes(street):
     assert street.nearest(20.0, 5.4, 0.0).lane_id == "b"
     assert street.nearest(20.0, 5.1, math.pi).lane_id == "back"
     assert street.nearest(20.0, 5.4).lane_id == "back"
 
 
-def test_only_lanes_of_the_kinds_asked_for_are_found(street):
+def test_nearest_filters_by_lane_kind_and_distance(street):
     assert street.nearest(20.0, -4.0).lane_id == "a"
     assert street.nearest(20.0, -4.0, kinds={"sidewalk"}).lane_id == "walk"
     assert street.nearest(20.0, -4.0, kinds={"bus"}) is None
     assert street.nearest(20.0, -40.0, within=10.0) is None
 
 
-def test_the_surface_of_the_road_is_lanes_and_areas(street):
+def test_lanes_and_areas_are_drivable(street):
     square = [[60, 30, 0], [70, 30, 0], [70, 40, 0], [60, 40, 0]]
     graph = LaneGraph.of(street.lanes.values(), areas=[Area("x", "junction", np.array(square))])
     places = [[20, 0], [20, -1.74], [20, -1.76], [20, 8.7], [20, 8.8], [65, 35], [65, 45]]
     assert graph.is_drivable(places).tolist() == [True, True, False, True, False, True, False]
 
 
-def test_routes_follow_successors_and_change_lanes_where_it_is_allowed(street):
+def test_routes_follow_successors_and_permitted_lane_changes(street):
     assert street.routes("a", 500.0) == [("a", "c")]
     assert street.routes("a", 30.0) == [("a",)]
     assert street.route("b", "c") == ("b", "a", "c")
@@ -100,7 +100,7 @@ def test_routes_follow_successors_and_change_lanes_where_it_is_allowed(street):
     assert street.predecessors["c"] == ("a",)
 
 
-def test_a_graph_that_is_moved_finds_the_same_places(street):
+def test_a_moved_graph_finds_the_same_positions(street):
     moved = street.moved(0.5, [10.0, -3.0, 2.0])
     x, y, z, heading = moved.lane("a").at(20.0, 0.3)
     assert z == 2.0
@@ -124,6 +124,6 @@ def test_a_graph_that_is_moved_finds_the_same_places(street):
         ),
     ],
 )  # fmt: skip
-def test_what_is_no_graph_is_refused_by_name(make, reason):
+def test_invalid_graphs_are_refused(make, reason):
     with pytest.raises(SceneError, match=reason):
         make()

@@ -69,7 +69,7 @@ def opencv(lens, points):
 
 
 @pytest.mark.parametrize("lens", LENSES[:4], ids=lambda lens: lens.model)
-def test_points_lie_where_opencv_sees_them(lens):
+def test_projection_matches_opencv(lens):
     points = directions()
     if isinstance(lens, Fisheye):  # OpenCV takes no points behind the camera.
         points = points[points[:, 2] > 0.01]
@@ -82,7 +82,7 @@ def test_points_lie_where_opencv_sees_them(lens):
 
 
 @pytest.mark.parametrize("lens", [None, *LENSES])
-def test_the_ray_of_a_pixel_leads_back_to_it(lens):
+def test_unproject_inverts_project(lens):
     pixels = np.random.default_rng(1).uniform([0, 0], [1280, 720], (10_000, 2))
     rays, valid = camera(lens).unproject(pixels)
     again, seen = camera(lens).project(rays[valid] * 7)
@@ -92,7 +92,7 @@ def test_the_ray_of_a_pixel_leads_back_to_it(lens):
 
 
 @pytest.mark.parametrize("lens", LENSES)
-def test_half_the_image_shows_the_same_directions(lens):
+def test_resizing_keeps_the_directions_of_pixels(lens):
     large, small = camera(lens), camera(lens).resized(640)
     np.testing.assert_allclose(
         small.project(directions(100))[0] * 2, large.project(directions(100))[0], atol=1e-6
@@ -100,11 +100,11 @@ def test_half_the_image_shows_the_same_directions(lens):
 
 
 @pytest.mark.parametrize("lens", LENSES)
-def test_a_lens_comes_back_from_its_values(lens):
+def test_a_lens_round_trips_through_json(lens):
     assert lens_from(json.loads(json.dumps(lens_values(lens)))) == lens
 
 
-def test_beyond_its_reach_a_lens_sees_nothing():
+def test_directions_beyond_the_field_of_view_are_invalid():
     behind = np.array([[0.0, 0, -1], [0.3, 0, -0.1], [0, 0, 1]])
     assert camera(BROWN).project(behind)[1].tolist() == [False, False, True]
     assert camera(F_THETA).project(behind)[1].tolist() == [False, True, True]
@@ -127,7 +127,7 @@ def test_beyond_its_reach_a_lens_sees_nothing():
         ({"model": "brown_conrady", "radial": [-0.9, 0, 0, 0, 0, 0]}, "valid up to 31.3 degrees"),
     ],
 )
-def test_a_lens_that_is_none_is_refused_with_the_reason(values, reason):
+def test_an_invalid_lens_is_refused_with_the_reason(values, reason):
     with pytest.raises(SceneError, match=reason):
         camera(lens_from(values))
 
@@ -159,7 +159,7 @@ def ncore_camera(golden, name, shutter):
     return Camera("ncore", *golden["size"], k, np.eye(4), lens, readout)
 
 
-def test_points_lie_where_ncore_sees_them_through_every_lens_and_shutter():
+def test_projection_matches_ncore_for_every_lens_and_shutter():
     golden = json.loads((Path(__file__).parent / "ncore_cameras.json").read_text())
     points, compared = np.array(golden["points"]), 0
     for case in golden["cases"]:
@@ -174,7 +174,7 @@ def test_points_lie_where_ncore_sees_them_through_every_lens_and_shutter():
 
 
 @pytest.mark.parametrize("direction", ["top_to_bottom", "bottom_to_top"])
-def test_a_pole_leans_by_speed_and_read_out(direction):
+def test_a_rolling_shutter_leans_a_pole_by_speed_and_readout(direction):
     # 15 m/s across the view; a pole 10 m ahead moves by 15 * 0.03 * 900 / 10 px from the first to
     # the last row.
     readout = Shutter(direction, 30_000)
@@ -186,7 +186,7 @@ def test_a_pole_leans_by_speed_and_read_out(direction):
     assert (pixels[2, 0] - pixels[0, 0] < -20) == (direction == "top_to_bottom")
 
 
-def test_what_moves_with_the_camera_stands_upright():
+def test_objects_moving_with_the_camera_do_not_lean():
     motion = CameraMotion.about(np.eye(4), np.array([15.0, 0, 0]), np.zeros(3), 0.03)
     pole = np.array([[0.0, y, 10.0] for y in (-3.8, 0, 3.8)])
     velocities = np.tile([15.0, 0, 0], (3, 1))
@@ -199,12 +199,12 @@ def test_what_moves_with_the_camera_stands_upright():
     ("direction", "readout_us"),
     [("sideways", 10), ("global", 5), ("top_to_bottom", 0), ("top_to_bottom", 10**6)],
 )
-def test_a_shutter_that_is_none_is_refused(direction, readout_us):
+def test_an_invalid_shutter_is_refused(direction, readout_us):
     with pytest.raises(SceneError, match="shutter: "):
         Shutter(direction, readout_us)
 
 
-def test_a_camera_knows_what_its_images_were():
+def test_a_camera_keeps_its_recorded_optics():
     device = Optics(K * [[1.02], [1.02], [1]], BROWN, Shutter("left_to_right", 20_000))
     known = replace(camera(), recorded=device)
     assert known.is_pinhole

@@ -1,4 +1,4 @@
-"""LiDARs: what they are built from, and what is refused."""
+"""LiDAR definitions: beams, catalogue and validation."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ from real2sim_server.scene.range_sensors import (
 BEAMS = {"kind": "spinning", "elevation_deg": [-5.0, 0.0, 5.0], "columns": 8}
 
 
-def test_a_turning_sensor_looks_ahead_at_its_time_stamp() -> None:
+def test_a_spinning_sensor_faces_ahead_at_its_timestamp() -> None:
     beams = Beams.spinning([0.0], columns=1000, rate_hz=10.0)
     ahead = np.abs(beams.azimuth[0]).argmin()
     assert abs(beams.time_us[0, ahead]) < 60
     assert beams.time_us.min() == pytest.approx(-49_950)
-    # Clockwise: what is left of the vehicle is seen before what is ahead.
+    # Clockwise: the left side is seen before the front.
     assert beams.time_us[0, np.abs(beams.azimuth[0] - np.pi / 2).argmin()] < -24_000
 
 
-def test_rows_with_offsets_look_aside() -> None:
+def test_azimuth_offsets_shift_rows() -> None:
     beams = Beams.spinning([0.0, 0.1], columns=8, azimuth_offset=[0.0, 0.05])
     assert np.allclose(beams.azimuth[1] - beams.azimuth[0], 0.05)
 
 
-def test_directions_are_of_unit_length() -> None:
+def test_directions_have_unit_length() -> None:
     assert np.allclose(np.linalg.norm(catalogue_lidar("rosette").beams.directions, axis=-1), 1)
 
 
-def test_a_table_with_many_instants_is_brought_to_few() -> None:
+def test_firing_times_are_quantised_to_slots() -> None:
     times = np.linspace(-50_000, 50_000, 5000)
     instants, slots = Beams(np.zeros(5000), np.zeros(5000), times).slots
     assert len(instants) == MAX_SLOTS
@@ -48,14 +48,14 @@ def test_a_table_with_many_instants_is_brought_to_few() -> None:
 
 
 @pytest.mark.parametrize("name", lidar_names())
-def test_every_lidar_of_the_catalogue_says_where_it_is_from(name: str) -> None:
+def test_every_catalogue_lidar_has_a_source(name: str) -> None:
     lidar = catalogue_lidar(name)
     assert lidar.name == name
     assert lidar.source
     assert 10_000 <= lidar.beams.count <= MAX_RAYS
 
 
-def test_the_catalogue_has_the_sensors_people_ask_for() -> None:
+def test_the_catalogue_has_common_sensors() -> None:
     wanted = {"hdl-64e", "vlp-16", "vlp-32c", "pandar64", "os1-128", "waymo-top"}
     assert wanted | {"solid-state", "rosette"} <= set(lidar_names())
     assert catalogue_lidar("pandar64").shape == (64, 1800)
@@ -66,7 +66,7 @@ def test_an_unknown_name_lists_the_known_ones() -> None:
         find_lidar("hdl64")
 
 
-def test_a_user_s_own_file_is_read(tmp_path: Path) -> None:
+def test_a_user_file_is_read(tmp_path: Path) -> None:
     file = tmp_path / "mine.json"
     file.write_text(json.dumps({"name": "mine", "beams": BEAMS, "range_m": [1, 50]}))
     lidar = find_lidar(str(file))
@@ -90,9 +90,7 @@ def test_a_user_s_own_file_is_read(tmp_path: Path) -> None:
         ({"T_vehicle_lidar": [[1, 0, 0, 0]]}, "four rows of four"),
     ],
 )
-def test_what_is_no_lidar_is_refused_with_the_reason(
-    values: dict[str, object], reason: str
-) -> None:
+def test_invalid_lidars_are_refused_with_the_reason(values: dict[str, object], reason: str) -> None:
     with pytest.raises(LidarError, match=reason):
         lidar_from_values({"name": "bad", "beams": BEAMS, **values})
 
@@ -103,7 +101,7 @@ def test_tables_of_different_lengths_are_refused() -> None:
         lidar_from_values({"name": "bad", "beams": table})
 
 
-def test_a_file_that_is_no_json_is_named(tmp_path: Path) -> None:
+def test_a_file_that_is_not_json_is_named(tmp_path: Path) -> None:
     file = tmp_path / "broken.json"
     file.write_text("{")
     with pytest.raises(LidarError, match=r"broken\.json: no readable JSON"):
@@ -116,12 +114,12 @@ def test_a_million_rays_are_refused() -> None:
         Beams(zeros, zeros, zeros)
 
 
-def test_values_that_are_not_finite_are_counted() -> None:
+def test_non_finite_values_are_counted() -> None:
     with pytest.raises(LidarError, match="2 of 3 values of elevation are not finite"):
         Beams(np.zeros(3), np.array([0, np.nan, np.inf]), np.zeros(3))
 
 
-def test_a_pose_that_is_no_transform_is_refused() -> None:
+def test_a_non_rigid_pose_is_refused() -> None:
     with pytest.raises(LidarError, match="not a rigid transform"):
         Lidar("x", Beams.spinning([0.0], columns=4), np.full((4, 4), np.nan))
 

@@ -6,7 +6,7 @@ import pytest
 from real2sim_server.scene.ground_fit import pull_push
 
 
-def test_pull_push_keeps_what_is_known_and_stays_within_its_range():
+def test_pull_push_keeps_known_values_and_their_range():
     rng = np.random.default_rng(0)
     values = rng.uniform(2, 3, (13, 22, 2)).astype(np.float32)
     weights = (rng.uniform(size=(13, 22)) < 0.1).astype(np.float32)

@@ -12,7 +12,7 @@ def test_objects_are_found_by_id_and_numbered_from_one_in_order(scene):
 
 
 @pytest.mark.parametrize("method", ["object", "instance_id"])
-def test_an_unknown_object_is_answered_with_those_there_are(scene, method):
+def test_an_unknown_object_is_refused_with_the_known_ones(scene, method):
     with pytest.raises(UnknownObjectError, match=r"no object 'car_9' in scene 'street'.*car_7"):
         getattr(scene, method)("car_9")
 
@@ -23,7 +23,7 @@ def test_counts_and_bytes_add_up(scene):
     assert scene.nbytes == sum(c.nbytes for c in clouds) + 6 * 4 * 4 * 3 * 4
 
 
-def test_its_time_is_that_of_the_ego(scene):
+def test_the_time_range_is_that_of_the_ego(scene):
     assert (scene.start_us, scene.end_us) == (7, 400_007)
 
 

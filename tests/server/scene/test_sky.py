@@ -11,12 +11,12 @@ def sky() -> Sky:
     return Sky(torch.rand(6, 8, 8, 3, generator=torch.Generator().manual_seed(0)))
 
 
-def test_directions_of_pixel_centres_give_the_texels(sky):
+def test_sampling_at_pixel_centres_returns_the_texels(sky):
     directions = torch.from_numpy(face_directions(sky.resolution))
     torch.testing.assert_close(sky.sample(directions), sky.faces, atol=1e-5, rtol=0)
 
 
-def test_length_of_a_direction_does_not_matter(sky):
+def test_direction_length_does_not_matter(sky):
     directions = torch.from_numpy(face_directions(5))
     torch.testing.assert_close(sky.sample(directions * 37), sky.sample(directions))
 
@@ -41,12 +41,12 @@ def test_face_coordinates_invert_face_directions():
         ([0, 0, -1], 5),
     ],
 )
-def test_axes_look_at_their_faces(direction, face):
+def test_axes_map_to_their_faces(direction, face):
     sky = Sky(torch.arange(6.0)[:, None, None, None].expand(6, 2, 2, 3).contiguous())
     assert sky.sample(torch.tensor(direction, dtype=torch.float32)).tolist() == [face] * 3
 
 
-def test_side_faces_stand_upright():
+def test_side_faces_are_upright():
     faces = torch.zeros(6, 8, 8, 3)
     faces[:4, :4] = 1
     directions = torch.tensor([[x, y, 0.5] for x, y in [(1, 0.1), (-1, 0.1), (0.1, 1), (0.1, -1)]])
@@ -79,6 +79,6 @@ def test_wrong_shapes_are_refused(faces):
         Sky(faces)
 
 
-def test_other_number_types_are_refused():
+def test_other_dtypes_are_refused():
     with pytest.raises(SceneError, match="float32"):
         Sky(torch.zeros(6, 2, 2, 3, dtype=torch.float64))

@@ -18,19 +18,19 @@ def bend() -> Trajectory:
     return Trajectory(TIMES, POSITIONS, yaw_quaternion(YAWS))
 
 
-def test_time_stamps_give_their_poses_exactly(bend):
+def test_keyframe_poses_are_returned_exactly(bend):
     for i, t in enumerate(TIMES):
         position, quaternion = bend.pose(int(t))
         np.testing.assert_array_equal(position, POSITIONS[i])
         np.testing.assert_array_equal(quaternion, bend.quaternions[i])
 
 
-def test_positions_between_time_stamps_are_linear(bend):
+def test_positions_are_interpolated_linearly(bend):
     np.testing.assert_allclose(bend.pose(1_250_000)[0], [2.5, 0, 0.25])
     np.testing.assert_allclose(bend.pose(3_500_000)[0], [10, 22.5, 1])
 
 
-def test_rotations_between_time_stamps_are_slerped(bend):
+def test_rotations_are_slerped(bend):
     assert quaternion_yaw(bend.pose(3_500_000)[1]) == pytest.approx(0.75 * np.pi / 2)
 
 
@@ -64,14 +64,14 @@ def test_a_single_pose_stands_still():
         lambda q: (np.linalg.norm(q, axis=1) > 0.1).all()
     )
 )
-def test_unit_quaternions_keep_their_bits_when_built_again(q):
+def test_normalizing_unit_quaternions_again_is_exact(q):
     quats = q / np.linalg.norm(q, axis=1, keepdims=True)
     once = Trajectory(np.arange(4), np.zeros((4, 3)), quats)
     twice = Trajectory(once.times_us, once.positions, once.quaternions)
     np.testing.assert_array_equal(once.quaternions, twice.quaternions)
 
 
-def test_transforms_in_and_out(bend):
+def test_transforms_round_trip(bend):
     transforms = np.stack([bend.transform(int(t)) for t in TIMES])
     again = Trajectory.from_transforms(TIMES, transforms)
     np.testing.assert_allclose(again.positions, bend.positions)
@@ -85,12 +85,12 @@ def test_moving_the_fixed_frame_moves_every_pose(bend):
         np.testing.assert_allclose(moved.transform(t), shift @ bend.transform(t), atol=1e-12)
 
 
-def test_relative_transform_leads_from_one_to_the_other(bend):
+def test_relative_transform_maps_one_pose_to_the_other(bend):
     a, b = bend.transform(1_500_000), bend.transform(3_000_000)
     np.testing.assert_allclose(a @ relative_transform(a, b), b, atol=1e-12)
 
 
-def test_later_changes_of_the_given_arrays_do_not_reach_it():
+def test_input_arrays_are_copied():
     positions = np.zeros((1, 3))
     trajectory = Trajectory([0], positions, [[1.0, 0, 0, 0]])
     positions[0, 0] = 99
@@ -122,7 +122,7 @@ def test_bad_input_is_refused(times, positions, quaternions, reason):
 
 
 @pytest.mark.parametrize("bad", [np.eye(4) * 2, np.diag([1.0, 1, -1, 1]), np.full((4, 4), np.nan)])
-def test_poses_that_are_no_rotations_are_refused_with_their_index(bad):
+def test_invalid_rotations_are_refused_with_their_index(bad):
     with pytest.raises(SceneError, match="index 1"):
         Trajectory.from_transforms([0, 1], np.stack([np.eye(4), bad]))
 

@@ -1,4 +1,4 @@
-"""Every test of simulations has one thread of torch."""
+"""All simulation tests use a single torch thread."""
 
 from __future__ import annotations
 

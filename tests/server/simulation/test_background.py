@@ -1,4 +1,4 @@
-"""The scene's background stops what hits it, and the ego takes part with a body of its own."""
+"""The scene's background stops what hits it, and the ego takes part as a body of its own."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def cloud(points) -> GaussianCloud:
 
 
 def surface(start, end, height, step=0.12) -> np.ndarray:
-    """[N, 3] points of an upright surface between two places of the plan."""
+    """[N, 3] points of an upright surface between two positions in plan view."""
     start, end = np.array(start, float), np.array(end, float)
     along = np.linspace(0, 1, round(float(np.linalg.norm(end - start)) / step) + 1)
     up = np.arange(0.05, height, step)
@@ -46,7 +46,7 @@ def surface(start, end, height, step=0.12) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    """A road along x, a house with two sides, a pole, and a crate that stands between."""
+    """A road along x, a house with two sides, a pole, and a crate between them."""
     corner = FOOT + 8 * WALL
     house = [
         surface(FOOT - 8 * WALL, corner, 3.0),
@@ -83,12 +83,12 @@ def covers(boxes, points) -> np.ndarray:
     return found
 
 
-def test_each_side_of_a_house_and_a_pole_is_a_box_where_it_was_seen(scene):
+def test_house_sides_and_a_pole_become_boxes_where_they_were_seen(scene):
     boxes = colliders(scene)
     assert len(boxes) <= 8
     seen = scene.background.means.numpy().astype(np.float64)
     assert covers(boxes, seen[:, :2]).mean() > 0.97
-    # Nothing stands before the face of the wall, and the wall is thick behind it.
+    # Nothing stands in front of the wall's face, and the wall is thick behind it.
     along = FOOT + np.linspace(-7, 6, 30)[:, None] * WALL
     assert not covers(boxes, along + 0.25 * NORMAL).any()
     assert covers(boxes, along - 0.3 * NORMAL).all()
@@ -98,8 +98,8 @@ def test_each_side_of_a_house_and_a_pole_is_a_box_where_it_was_seen(scene):
     assert tops == pytest.approx([2.9] * len(boxes), abs=0.2)
 
 
-def test_where_an_object_starts_nothing_stands(scene):
-    """Not even what of the background lies in its own box."""
+def test_no_background_box_overlaps_an_objects_start(scene):
+    """Not even background that lies inside its own box."""
     place = (*(FOOT + 0.2 * NORMAL), 0.6)
     starts = Cleared(at(*place), np.array(CRATE))
     for box in colliders(scene, place):
@@ -124,7 +124,7 @@ def crash(scene, state, name, velocity, **options):
 
 
 @pytest.mark.parametrize("background", [True, False])
-def test_what_slides_into_a_house_stops_there(scene, background):
+def test_a_block_sliding_into_a_house_stops_there(scene, background):
     state = ScenarioState.of(scene)
     velocity = (*(-8.0 * NORMAL), 0.0)
     result = crash(
@@ -145,7 +145,7 @@ def test_what_slides_into_a_house_stops_there(scene, background):
 
 
 @pytest.mark.slow
-def test_a_car_that_is_pushed_at_a_house_of_the_demos_street_stops_there():
+def test_a_car_pushed_into_a_house_of_the_demo_street_stops_there():
     street = read_packed(SHIPPED)
     result = simulate(
         street,
@@ -164,7 +164,7 @@ def test_a_car_that_is_pushed_at_a_house_of_the_demos_street_stops_there():
     assert any(c.other.startswith("background.") and c.delta_v > 2 for c in result.contacts)
 
 
-def test_the_ego_takes_part_and_is_seen(scene):
+def test_the_ego_takes_part_and_is_visible(scene):
     complete, state = with_ego(scene, ScenarioState.of(scene))
     result = crash(complete, state, EGO, (0.0, 0.0, 0.0), duration=0.1, background=True)
     own = result.objects[EGO]

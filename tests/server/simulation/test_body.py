@@ -1,4 +1,4 @@
-"""A body changes from rigid to deforming and back without a jolt, and keeps its own time."""
+"""A body switches between rigid and deforming without a jolt, and keeps its own time."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def activated(body: DeformableBody) -> Solver:
     return Solver([body.solver_body()], (), options)
 
 
-def test_activation_keeps_momentum_angular_momentum_and_pose():
+def test_activation_preserves_momentum_angular_momentum_and_pose():
     body = thrown()
     before, pose = body.motion, body.T_world_object
     solver = activated(body)
@@ -60,7 +60,7 @@ def test_activation_keeps_momentum_angular_momentum_and_pose():
     np.testing.assert_allclose(body.T_world_object, pose, atol=1e-9)
 
 
-def test_rigidifying_keeps_momentum_angular_momentum_pose_and_every_particle():
+def test_becoming_rigid_preserves_momentum_angular_momentum_pose_and_particles():
     body = thrown()
     solver = activated(body)
     solver.step(0.02)
@@ -75,8 +75,8 @@ def test_rigidifying_keeps_momentum_angular_momentum_pose_and_every_particle():
     np.testing.assert_allclose(again, points, atol=1e-12)
 
 
-def test_a_pole_turns_by_its_own_inertia_and_not_by_that_of_the_grid():
-    """What a post beside its middle gives to a slender pole sets its turning about its length."""
+def test_a_pole_turns_with_its_own_inertia_not_that_of_the_grid():
+    """An off-centre hit by a post makes a slender pole spin about its length."""
     width, length = 0.2, 1.0
     particles = box_particles((width, width, length), spacing=0.1, density=200.0)
     body = thrown(
@@ -109,7 +109,7 @@ def test_a_pole_turns_by_its_own_inertia_and_not_by_that_of_the_grid():
     np.testing.assert_allclose(body.motion.angular_velocity, m.angular_velocity, atol=1e-9)
 
 
-def test_a_body_put_to_sleep_stands_still_and_is_rigid():
+def test_a_sleeping_body_is_still_and_rigid():
     body = thrown()
     solver = activated(body)
     body.update_from_solver(solver.state("box"))
@@ -120,13 +120,13 @@ def test_a_body_put_to_sleep_stands_still_and_is_rigid():
 
 
 def solved(**options) -> DeformableBody:
-    """A body that a solver has just taken over."""
+    """A body that the solver has just taken over."""
     body = thrown(**options)
     body.update_from_solver(activated(body).state("box"))
     return body
 
 
-def test_a_body_that_moves_as_a_whole_may_become_rigid_but_not_sleep():
+def test_a_body_moving_as_a_whole_may_become_rigid_but_not_sleep():
     body = solved()
     body.update_timers(SETTLE_TIME)
     assert not body.may_rigidify
@@ -135,7 +135,7 @@ def test_a_body_that_moves_as_a_whole_may_become_rigid_but_not_sleep():
     assert not body.may_sleep
 
 
-def test_a_body_that_hardly_moves_may_sleep_after_the_sleep_time():
+def test_a_nearly_still_body_may_sleep_after_the_sleep_time():
     body = solved(velocity=np.zeros(3), angular_velocity=np.zeros(3))
     body.update_timers(SLEEP_TIME)
     assert not body.may_sleep
@@ -143,7 +143,7 @@ def test_a_body_that_hardly_moves_may_sleep_after_the_sleep_time():
     assert body.may_sleep
 
 
-def test_a_body_that_vibrates_is_not_settled():
+def test_a_vibrating_body_is_not_settled():
     body = solved(velocity=np.zeros(3), angular_velocity=np.zeros(3))
     rng = np.random.default_rng(0)
     body.state = replace(body.state, velocities=rng.normal(size=body.state.velocities.shape))
@@ -152,7 +152,7 @@ def test_a_body_that_vibrates_is_not_settled():
     assert not body.may_rigidify
 
 
-def test_a_body_keeps_the_shape_it_is_given_and_its_centre_of_mass():
+def test_a_body_keeps_its_given_shape_and_centre_of_mass():
     dented = solved()
     dented.rigidify()
     pose = dented.T_world_object

@@ -1,4 +1,4 @@
-"""Values of an object are found again from boxes, points and images, within their uncertainty."""
+"""An object's parameters are recovered from boxes, points and images, within uncertainty."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def state(scene):
 
 
 def thrown(stiffness=1.0, friction=1.0, speed=1.0, **changes) -> SimulateOptions:
-    """A soft block that slides onto the ground; with the true values, or others."""
+    """A soft block sliding onto the ground, with the true values or others."""
     own = ObjectPhysics(
         material=replace(SOFT, young=stiffness * SOFT.young),
         friction=0.4 * friction,
@@ -103,11 +103,11 @@ def calibrated(scene, state, observation, *parameters):
 
 
 def within(found, name, deviations=1.0) -> bool:
-    """Whether a factor is right within so many of the standard deviations that are claimed."""
+    """Whether a factor is right within that many of the claimed standard deviations."""
     return abs(found.factors[name] / TRUE[name] - 1) < deviations * found.uncertainty[name]
 
 
-def test_marked_points_tell_stiffness_friction_and_speed(scene, state, truth):
+def test_marked_points_determine_stiffness_friction_and_speed(scene, state, truth):
     found = calibrated(scene, state, points_of(truth), *TRUE)
     assert found.residual[-1] < 0.2 * found.residual[0]
     for name, factor in TRUE.items():
@@ -116,7 +116,7 @@ def test_marked_points_tell_stiffness_friction_and_speed(scene, state, truth):
         assert found.observation[name] < found.uncertainty[name] < 1
 
 
-def test_boxes_tell_speed_but_no_yield_stress(scene, state, truth):
+def test_boxes_determine_speed_but_not_yield_stress(scene, state, truth):
     found = calibrated(scene, state, boxes_of(truth), "speed", "yield_stress")
     assert found.undetermined == ["yield_stress"]
     assert found.factors["yield_stress"] == 1.0
@@ -124,17 +124,17 @@ def test_boxes_tell_speed_but_no_yield_stress(scene, state, truth):
     assert found.factors["speed"] == pytest.approx(TRUE["speed"], rel=0.06)
 
 
-def test_small_images_tell_speed(scene, state, truth, worker_kernels):
+def test_small_images_determine_speed(scene, state, truth, worker_kernels):
     found = calibrated(scene, state, images_of(scene, state, truth), "speed")
     assert found.factors["speed"] == pytest.approx(TRUE["speed"], rel=0.06)
     assert within(found, "speed")
 
 
 @pytest.mark.slow
-def test_what_was_observed_on_half_the_cells_is_found_within_the_uncertainty(scene, state):
-    """The part that is due to cells is most of it, and observations alone would claim too much.
+def test_parameters_observed_on_half_size_cells_are_found_within_uncertainty(scene, state):
+    """Most of the uncertainty comes from the cells; observations alone would claim too much.
 
-    Two standard deviations, as 19 of 20 measurements are: here the cells really differ.
+    Two standard deviations cover 19 of 20 measurements; here the cells really differ.
     """
     finer = simulate(scene, state, thrown(**TRUE, grid=16))
     observed = points_of(finer)
@@ -153,7 +153,7 @@ def test_what_was_observed_on_half_the_cells_is_found_within_the_uncertainty(sce
     assert found.discretisation["stiffness"] > found.observation["stiffness"]
 
 
-def test_observations_that_tell_nothing_are_refused(scene, state, truth):
+def test_uninformative_observations_are_refused(scene, state, truth):
     with pytest.raises(PhysicsError, match="do not determine yield_stress"):
         calibrated(scene, state, boxes_of(truth), "yield_stress")
 
@@ -162,7 +162,7 @@ def test_observations_that_tell_nothing_are_refused(scene, state, truth):
     ("parameters", "message"),
     [(["colour"], "cannot fit .*allowed are stiffness"), ([], "allowed are")],
 )
-def test_what_cannot_be_fitted_is_named(scene, state, truth, parameters, message):
+def test_parameters_that_cannot_be_fitted_are_named(scene, state, truth, parameters, message):
     with pytest.raises(PhysicsError, match=message):
         calibrated(scene, state, boxes_of(truth), *parameters)
 
@@ -179,13 +179,13 @@ def test_what_cannot_be_fitted_is_named(scene, state, truth, parameters, message
         ({}, "nothing was observed"),
     ],
 )
-def test_observations_that_cannot_be_are_refused(scene, state, given, message):
+def test_invalid_observations_are_refused(scene, state, given, message):
     [subject] = state.visible
     with pytest.raises((PhysicsError, ValueError), match=message):
         observations_of(Observations.model_validate(given), scene, subject, 0, 10**6)
 
 
-def test_observations_of_all_kinds_are_read(scene, state):
+def test_all_kinds_of_observations_are_read(scene, state):
     [subject] = state.visible
     png = cv2.imencode(".png", np.full((128, 192, 3), (1, 2, 3), np.uint8))[1].tobytes()
     given = {
@@ -207,7 +207,7 @@ def test_observations_of_all_kinds_are_read(scene, state):
     assert (image.shape, image[0, 0].tolist()) == ((64, 96, 3), [3, 2, 1])
 
 
-def test_boxes_shorten_when_an_object_is_crushed(scene, state, truth):
+def test_boxes_get_shorter_when_an_object_is_crushed(scene, state, truth):
     own = truth.objects["block"]
     sizes = np.array([SIZE] * 5)
     track = BoxTrack(truth.times_s[1:], own.positions[1:], sizes=sizes, size_sigma=1.0)
@@ -216,7 +216,7 @@ def test_boxes_shorten_when_an_object_is_crushed(scene, state, truth):
     assert off[:, 2].min() < -0.02
 
 
-def test_the_fit_of_a_line_has_the_uncertainty_of_least_squares():
+def test_fitting_a_line_gives_the_least_squares_uncertainty():
     x = np.linspace(1, 2, 20)
 
     def residuals(factors, coarser):
@@ -225,5 +225,5 @@ def test_the_fit_of_a_line_has_the_uncertainty_of_least_squares():
     found = fit(residuals, ["a"])
     assert found.factors["a"] == pytest.approx(1.9, rel=1e-3)
     assert found.observation["a"] == pytest.approx(0.1 / np.sqrt(x @ x) / 1.9, rel=0.05)
-    # On cells of no size it would be 2.0.
+    # On infinitely small cells it would be 2.0.
     assert found.discretisation["a"] == pytest.approx(0.1 / 1.9, rel=0.1)

@@ -1,4 +1,4 @@
-"""What contacts say of support and impact."""
+"""What contacts say about support and impact."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MASS, GRAVITY, DT = 1000.0, np.array([0.0, 0.0, -9.81]), 0.01
 
 
 def recorded(steps: int, *struck: tuple[int, np.ndarray]):
-    """A car that stands for so many steps and is struck in some, by the ground alone."""
+    """A car that stands for a number of steps and is struck in some, by the ground alone."""
     log = ContactLog()
     for step in range(steps):
         carried = -MASS * GRAVITY * DT
@@ -28,18 +28,18 @@ def recorded(steps: int, *struck: tuple[int, np.ndarray]):
     return log.records({"car": MASS}, GRAVITY)[0]
 
 
-def test_what_only_carries_a_weight_is_no_impact():
+def test_carrying_a_weight_is_not_an_impact():
     record = recorded(200)
     assert record.delta_v == pytest.approx(9.81 * 2.0)
     assert record.impact_delta_v < 0.1 + 1e-9
 
 
 @pytest.mark.parametrize("impulse", [(0.0, 0.0, 5000.0), (3000.0, 4000.0, 0.0)])
-def test_an_impact_counts_whole_beside_the_weight(impulse):
+def test_an_impact_counts_in_full_on_top_of_the_weight(impulse):
     assert recorded(200, (50, np.array(impulse))).impact_delta_v == pytest.approx(5.0, abs=0.1)
 
 
-def test_sleep_between_contacts_asks_for_no_impulse():
+def test_sleep_between_contacts_needs_no_impulse():
     log, fall = ContactLog(), np.array([0.0, 0.0, 4.5 * MASS])
     for step in range(500):
         carried = -MASS * GRAVITY * DT
@@ -50,8 +50,8 @@ def test_sleep_between_contacts_asks_for_no_impulse():
     assert record.impact_delta_v == pytest.approx(4.5, abs=0.1)
 
 
-def test_equal_falls_are_equal_impacts_whatever_falls_beside_them():
-    """A block that has landed sleeps, and is asked again what holds it once the other lands."""
+def test_equal_falls_give_equal_impacts_whatever_falls_nearby():
+    """A landed block sleeps; its support is checked again when the other one lands."""
     size, heights = (0.8, 0.6, 0.6), {"low": 1.05, "low_too": 1.05, "high": 4.0}
     objects = {
         name: SceneObject(

@@ -57,7 +57,7 @@ def skin(count: int = 40) -> GaussianCloud:
 
 
 def crushed_front(by: float = CRUSHED) -> np.ndarray:
-    """[N, 3] displacements that shorten the front third of the length by a fraction."""
+    """[N, 3] displacements that shorten the front third by a fraction."""
     moved = np.zeros_like(PARTICLES)
     begins = SIZE[0] / 2 - SIZE[0] / 3
     moved[:, 0] = -by * np.maximum(PARTICLES[:, 0] - begins, 0.0)
@@ -90,7 +90,7 @@ def length(cloud: GaussianCloud, first: int, last: int) -> float:
     return float(np.linalg.norm(steps, axis=1).sum())
 
 
-def test_sheet_that_is_shortened_folds_and_so_keeps_most_of_its_length(vehicle):
+def test_shortened_sheet_metal_folds_and_keeps_most_of_its_length(vehicle):
     rest, folded = drawn(vehicle, crushed_front())
     first, last = 29, 40
     shortened = length(smooth(crushed_front()), first, last) / length(rest, first, last)
@@ -98,14 +98,14 @@ def test_sheet_that_is_shortened_folds_and_so_keeps_most_of_its_length(vehicle):
     assert length(folded, first, last) / length(rest, first, last) > shortened + 0.1
 
 
-def test_folds_face_elsewhere_and_are_lit_otherwise(vehicle):
+def test_folds_change_orientation_and_shading(vehicle):
     rest, folded = drawn(vehicle, crushed_front())
     light = folded.sh[29:40, 0, 0] / rest.sh[29:40, 0, 0]
     assert float(light.max() - light.min()) > 0.15
 
 
 def dented_side(depth: float = 0.2) -> np.ndarray:
-    """[N, 3] displacements of a trough in the left side, as a bumper leaves it."""
+    """[N, 3] displacements of a trough in the left side, as a bumper leaves."""
     moved = np.zeros_like(PARTICLES)
     left = PARTICLES[:, 1] > 0.3
     moved[left, 1] = -depth * np.exp(-((PARTICLES[left, 0] / 0.7) ** 2))
@@ -113,12 +113,12 @@ def dented_side(depth: float = 0.2) -> np.ndarray:
 
 
 def lights(rest, drawn):
-    """[40] brightness of the side's Gaussians against what it was."""
+    """[40] brightness of the side's Gaussians relative to before."""
     colour = [0.5 + SH_0 * cloud.sh[:40, 0].mean(dim=1) for cloud in (drawn, rest)]
     return (colour[0] / colour[1]).numpy()
 
 
-def test_a_dent_in_a_side_is_seen_by_its_light(vehicle):
+def test_a_side_dent_shows_in_the_shading(vehicle):
     rest, dented = drawn(vehicle, dented_side())
     pressed = slice(13, 27)
     light = lights(rest, dented)[pressed]
@@ -126,7 +126,7 @@ def test_a_dent_in_a_side_is_seen_by_its_light(vehicle):
     assert light.min() < 0.85
 
 
-def test_paint_is_scraped_where_sheet_was_pushed_in_and_nowhere_else():
+def test_paint_is_scraped_only_where_metal_was_pushed_in():
     x, z = (a.ravel() for a in np.meshgrid(np.linspace(-2.2, 2.2, 89), np.linspace(-0.4, 0.3, 15)))
     side = np.stack([x, np.full(len(x), 0.9), z], axis=1).astype(np.float32)
     red = skin(len(x)).select(torch.arange(len(x)))
@@ -144,7 +144,7 @@ def test_paint_is_scraped_where_sheet_was_pushed_in_and_nowhere_else():
 
 
 @pytest.mark.parametrize("depth", [0.1, 0.2, 0.4])
-def test_light_on_dents_and_their_height_are_bounded(vehicle, depth):
+def test_dent_shading_and_height_are_bounded(vehicle, depth):
     rest, dented = drawn(vehicle, dented_side(depth))
     light = lights(rest, dented)
     assert light.min() >= 0.3
@@ -156,8 +156,8 @@ def test_light_on_dents_and_their_height_are_bounded(vehicle, depth):
 
 
 @pytest.mark.parametrize("moved", ["towards", "aside", "turned"])
-def test_rigid_motion_changes_no_light(vehicle, moved):
-    """Of bodies whose particles went along with what pushed them without any dent."""
+def test_rigid_motion_does_not_change_the_shading(vehicle, moved):
+    """For bodies whose particles moved along with what pushed them, without any dent."""
     cloud, made = vehicle
     turn = np.eye(3)
     if moved == "turned":
@@ -168,21 +168,21 @@ def test_rigid_motion_changes_no_light(vehicle, moved):
     np.testing.assert_array_equal(went.sh.numpy()[:40], cloud.sh.numpy()[:40])
 
 
-def test_what_was_not_crushed_stays_as_it_was(vehicle):
+def test_uncrushed_parts_are_unchanged(vehicle):
     rest, folded = drawn(vehicle, crushed_front())
     behind = slice(0, 20)
     for name in ("means", "quats", "scales", "sh"):
         assert torch.equal(getattr(folded, name)[behind], getattr(rest, name)[behind])
 
 
-def test_folds_stay_when_what_is_behind_them_springs_back(vehicle):
+def test_folds_remain_after_springback(vehicle):
     cloud, made = vehicle
     most = made.shortening(crushed_front())
     back = made.cloud(np.zeros_like(PARTICLES), most, {})
     assert float((back.means - cloud.means)[29:40].abs().max()) > 0.01
 
 
-def test_crumpled_sheet_is_flat_between_ridges_and_nowhere_torn():
+def test_crumpled_metal_is_flat_between_ridges_and_never_torn():
     t = np.linspace(0.0, 1.0, 20_001)
     line = np.stack([t, 0.3 * t, 0.9 + 0.1 * t], axis=1)
     height, slope = crumple(line, seed=7)
@@ -195,7 +195,7 @@ def test_crumpled_sheet_is_flat_between_ridges_and_nowhere_torn():
     np.testing.assert_allclose(steps[1:][flat], along[1:-1][flat], atol=1e-9)
 
 
-def test_side_windows_go_dark_up_to_the_roof_where_they_lean_inwards():
+def test_inward_leaning_side_windows_go_dark_up_to_the_roof():
     glass = torch.full((3, 1, 3), -1.0)
     row = np.array([[0.0, 0.85, 0.3], [0.0, 0.55, 0.5], [0.0, 0.2, 0.5]], dtype=np.float32)
     cloud = replace(skin(2).select(torch.arange(3)), means=torch.from_numpy(row), sh=glass)
@@ -209,7 +209,7 @@ def test_side_windows_go_dark_up_to_the_roof_where_they_lean_inwards():
     assert not dark[:-3].any()
 
 
-def test_a_bonnet_rises_in_the_middle(vehicle):
+def test_the_bonnet_buckles_up_in_the_middle(vehicle):
     x = np.linspace(1.5, 2.25, 16)
     row = np.stack([x, np.zeros(16), np.full(16, 0.3)], axis=1).astype(np.float32)
     bonnet = replace(skin(8), means=torch.from_numpy(row))
@@ -223,7 +223,7 @@ def test_a_bonnet_rises_in_the_middle(vehicle):
     assert rise[5:11].max() > max(rise[0], rise[-1]) + 0.05
 
 
-def test_no_gaussian_becomes_a_needle(vehicle):
+def test_no_gaussian_becomes_needle_shaped(vehicle):
     pulled = np.zeros_like(PARTICLES)
     pulled[:, 0] = 6.0 * np.maximum(PARTICLES[:, 0] - 1.5, 0.0)
     rest, torn = drawn(vehicle, pulled)
@@ -232,13 +232,13 @@ def test_no_gaussian_becomes_a_needle(vehicle):
     assert float(smooth(pulled).scales.max()) > 1.9 * float(rest.scales.max())
 
 
-def test_the_same_bits_come_of_the_same_crash(vehicle):
+def test_damage_is_reproducible(vehicle):
     one, two = (drawn(vehicle, crushed_front(), {"front bumper": 0.2})[1] for _ in range(2))
     for name in ("means", "quats", "scales", "sh"):
         assert torch.equal(getattr(one, name), getattr(two, name))
 
 
-def test_a_loose_bumper_sinks_and_comes_to_rest_above_the_road():
+def test_a_loose_bumper_sags_and_comes_to_rest_above_the_road():
     y = np.linspace(-0.88, 0.88, 30)
     row = np.stack([np.full(30, 2.25), y, np.full(30, -0.55)], axis=1).astype(np.float32)
     cloud = replace(skin(15), means=torch.from_numpy(row))
@@ -256,7 +256,7 @@ def test_a_loose_bumper_sinks_and_comes_to_rest_above_the_road():
     assert float(height(HANGS_STILL).min()) == pytest.approx(CLEARANCE, abs=1e-5)
 
 
-def test_a_front_that_is_pushed_in_breaks_what_is_there():
+def test_a_crushed_front_breaks_the_parts_there():
     log = BreakageLog("car", SIZE, PARTICLES, spacing=SPACING)
     assert log.follow(np.zeros_like(PARTICLES)) == []
     broken = {part.name for part in log.follow(crushed_front())}
@@ -265,7 +265,7 @@ def test_a_front_that_is_pushed_in_breaks_what_is_there():
     assert log.follow(crushed_front()) == []
 
 
-def test_a_racked_side_breaks_its_windows():
+def test_a_sheared_side_breaks_its_windows():
     moved = np.zeros_like(PARTICLES)
     left = PARTICLES[:, 1] > 0.4
     moved[left, 1] = -0.3 * np.exp(-((PARTICLES[left, 0] / 0.6) ** 2))
@@ -282,7 +282,7 @@ def test_only_vehicles_have_parts():
 
 
 def crash_result(object_id: str, pose, breakages) -> SimulationResult:
-    """Four frames in which the front of an object is pushed in at the second."""
+    """Four frames; the front of an object is pushed in at the second."""
     shapes = np.array([crushed_front()], dtype=np.float16)
     own = ObjectResult(
         object_id,
@@ -318,7 +318,7 @@ def crash(tiny_scene):
     return state, replace(result, breakages=find_breakages(result, state.visible))
 
 
-def test_parts_break_in_the_frame_that_pushes_them_in(crash):
+def test_parts_break_in_the_frame_that_crushes_them(crash):
     _, result = crash
     assert {b.time_s for b in result.breakages} == {2.0}
     lamp = next(b for b in result.breakages if b.part == "front left lamp")
@@ -326,13 +326,13 @@ def test_parts_break_in_the_frame_that_pushes_them_in(crash):
     assert lamp.position[1] > -3.0
 
 
-def test_breakages_are_kept_with_the_result(crash, tmp_path):
+def test_breakages_are_saved_with_the_result(crash, tmp_path):
     _, result = crash
     result.save(tmp_path / "kept")
     assert SimulationResult.load(tmp_path / "kept").breakages == result.breakages
 
 
-def test_results_from_before_have_none_and_are_drawn_as_they_were(crash, tiny_scene, tmp_path):
+def test_older_results_have_no_breakages_and_are_drawn_unchanged(crash, tiny_scene, tmp_path):
     state, result = crash
     replace(result, breakages=None).save(tmp_path / "old")
     old = SimulationResult.load(tmp_path / "old")
@@ -344,7 +344,7 @@ def test_results_from_before_have_none_and_are_drawn_as_they_were(crash, tiny_sc
     assert len(red.cloud) == len(source)
 
 
-def test_fragments_are_drawn_once_something_broke_and_lie_on_the_road(crash, tiny_scene):
+def test_fragments_appear_after_breakage_and_lie_on_the_road(crash, tiny_scene):
     state, result = crash
     playback = Playback(tiny_scene, state, result)
     before = len(playback.instances(0))
@@ -359,7 +359,7 @@ def test_fragments_are_drawn_once_something_broke_and_lie_on_the_road(crash, tin
     assert above.min() > 0.0
 
 
-def test_fragments_fly_before_they_lie_and_then_stay(crash):
+def test_fragments_fly_then_land_and_stay(crash):
     _, result = crash
     flat = lambda places: np.zeros(len(places))  # noqa: E731
     flying, lying, later = (
@@ -370,7 +370,7 @@ def test_fragments_fly_before_they_lie_and_then_stay(crash):
     assert fragment_cloud(result.breakages, 1.9, flat) is None
 
 
-def test_what_turns_over_shows_a_floor_instead_of_its_shadow():
+def test_an_overturned_vehicle_shows_a_floor_instead_of_its_shadow():
     x = np.linspace(-2.2, 2.2, 60)
     low = np.stack([x, np.zeros(60), np.full(60, 0.05 - SIZE[2] / 2)], axis=1).astype(np.float32)
     wheel = torch.tensor([[0.3 * SIZE[0], 0.8, 0.1 - SIZE[2] / 2]])
@@ -389,7 +389,7 @@ def test_what_turns_over_shows_a_floor_instead_of_its_shadow():
 
 
 @pytest.mark.parametrize("over", [False, True])
-def test_only_vehicles_that_turn_over_get_a_floor(crash, tiny_scene, over):
+def test_only_overturned_vehicles_get_a_floor(crash, tiny_scene, over):
     state, result = crash
     own = result.objects["car_red"]
     turned = np.tile((0.0, 1.0, 0.0, 0.0) if over else (0.99, 0.1, 0.0, 0.1), (4, 1))

@@ -1,4 +1,4 @@
-"""Gaussians follow the particles of the body that they are in."""
+"""Gaussians follow the particles of their body."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_dented_gaussians_keep_their_uncertainties():
     assert torch.equal(part.means[:5], moved.means[:5])
 
 
-def test_gaussians_split_by_a_dent_have_the_uncertainty_of_the_one_they_were():
+def test_gaussians_split_by_a_dent_inherit_the_uncertainty():
     cloud = random_cloud(np.random.default_rng(2), 6)
     cloud = replace(cloud, uncertainties=torch.linspace(0, 1, 6))
     stretched = np.repeat(np.diag([5.0, 1, 1])[None], 2, axis=0)
@@ -70,7 +70,7 @@ def test_gaussians_split_by_a_dent_have_the_uncertainty_of_the_one_they_were():
     assert torch.equal(split.uncertainties[6:], cloud.uncertainties[[1, 4]])
 
 
-def test_a_rotation_of_the_matter_is_a_rotation_of_the_cloud_colours_included():
+def test_rotating_the_matter_rotates_the_cloud_including_its_colours():
     rng = np.random.default_rng(1)
     rest, cloud = lattice().positions, random_cloud(rng, sh_degree=3)
     pose = at(0.3, 0.1, 0.2)
@@ -83,7 +83,7 @@ def test_a_rotation_of_the_matter_is_a_rotation_of_the_cloud_colours_included():
     np.testing.assert_allclose(covariances(moved), covariances(expected), atol=1e-7)
 
 
-def test_gaussians_follow_the_total_deformation_that_the_solver_has():
+def test_gaussians_follow_the_solvers_total_deformation():
     particles = lattice(size=(0.8, 0.8, 0.8), spacing=0.08)
     x = particles.positions
     velocities = np.stack([-0.8 * x[:, 0], 0.3 * x[:, 0] + 0.2 * x[:, 1], 0.1 * x[:, 2]], axis=1)
@@ -105,7 +105,7 @@ def test_gaussians_follow_the_total_deformation_that_the_solver_has():
     np.testing.assert_allclose(followed.positions, state.positions[deep], atol=2e-3)
 
 
-def test_a_gaussian_across_a_tear_does_not_become_a_sheet():
+def test_a_gaussian_across_a_tear_is_not_stretched_into_a_sheet():
     rest = lattice().positions
     torn = np.where(rest[:, :1] > 0, [[5.0, 0, 0]], [[0.0, 0, 0]])
     cloud = random_cloud(np.random.default_rng(2))

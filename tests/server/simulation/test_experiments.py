@@ -1,4 +1,4 @@
-"""The paper's experiments: who takes part, when things touch, and what is seen of it."""
+"""The paper's experiments: who takes part, when things touch, and what the camera sees."""
 
 from __future__ import annotations
 
@@ -45,16 +45,18 @@ def first_touch(result, *, other):
     return min(c.first_s for c in result.contacts if c.other == other)
 
 
-def test_the_wall_is_met_after_half_a_metre(experiment, rollout):
+def test_the_wall_is_reached_after_half_a_metre(experiment, rollout):
     result = rollout(experiment("wall", objects=["car_red"]), 0.24)
     assert first_touch(result, other="wall") == pytest.approx(0.5 / 2.5, abs=0.02)
 
 
-def test_runners_meet_those_they_run_into_after_a_metre_and_a_half(experiment, rollout, tiny_scene):
+def test_moving_vehicles_reach_the_others_after_one_and_a_half_metres(
+    experiment, rollout, tiny_scene
+):
     made = experiment("pair", objects=["car_red", "car_blue"])
     assert made.options.gravity == (0.0, 0.0, 0.0)
     result = rollout(made, 0.5)
-    # The way is measured between the experiment's own particles. These are farther apart, half a
+    # Distance is measured between the experiment's own particles. These are farther apart: half a
     # cell of the grid, and each surface may lie up to half of that elsewhere.
     volumes = [np.prod(tiny_scene.objects[o].size) for o in ("car_red", "car_blue")]
     spacing = float(np.cbrt(sum(volumes) / PARTICLES))
@@ -62,7 +64,7 @@ def test_runners_meet_those_they_run_into_after_a_metre_and_a_half(experiment, r
 
 
 @pytest.mark.parametrize("count", [2, 3, 5, 8])
-def test_any_number_of_vehicles_run_into_as_many_and_none_begins_within_another(tiny_scene, count):
+def test_any_number_of_pairs_collide_and_none_starts_overlapping(tiny_scene, count):
     copies = [Duplicate(object_id="car_red", new_id=f"copy_{k}", x=5.0 * k) for k in range(7)]
     state = apply_operations(ScenarioState.of(tiny_scene), copies).state
     names = ("car_red", "car_blue", *(f"copy_{k}" for k in range(7)))[:count]
@@ -77,21 +79,21 @@ def test_any_number_of_vehicles_run_into_as_many_and_none_begins_within_another(
 
 
 @pytest.mark.parametrize("preset", ["paper", "vehicle"])
-def test_what_is_dropped_reaches_the_road_after_half_a_second(experiment, rollout, preset):
+def test_a_dropped_object_reaches_the_road_after_half_a_second(experiment, rollout, preset):
     made = experiment("drop", objects=["car_red"], preset=preset)
     result = rollout(made, 0.56)
     touches = [c.first_s for c in result.contacts if c.other in ("ground", "tyres")]
     assert min(touches) == pytest.approx(0.5, abs=0.06)
 
 
-def test_unknown_experiments_and_objects_are_named(experiment):
+def test_unknown_experiments_and_objects_are_reported_by_name(experiment):
     with pytest.raises(PhysicsError, match="allowed are wall, pair, drop"):
         experiment("jump")
     with pytest.raises(PhysicsError, match="nobody"):
         experiment("wall", objects=["nobody"])
 
 
-def test_a_vehicle_that_drives_ahead_was_seen_from_behind(tiny_scene):
+def test_a_vehicle_driving_ahead_was_seen_from_behind(tiny_scene):
     state = ScenarioState.of(tiny_scene)
     blue = next(o for o in state.visible if o.object_id == "car_blue")
     seen = visibility_of(tiny_scene, blue)
@@ -100,7 +102,7 @@ def test_a_vehicle_that_drives_ahead_was_seen_from_behind(tiny_scene):
     assert seen.whole == seen.rear + seen.front
 
 
-def test_a_wall_is_shown_behind_its_surface(experiment, tiny_scene):
+def test_a_wall_is_drawn_behind_its_surface(experiment, tiny_scene):
     made = experiment("wall", objects=["car_red"])
     wall = next(c for c in made.options.colliders if c.name == "wall")
     [obstacle] = FilmPlan.of(made, tiny_scene.ground.height).obstacles
@@ -111,7 +113,7 @@ def test_a_wall_is_shown_behind_its_surface(experiment, tiny_scene):
     assert FilmPlan.of(dropped, tiny_scene.ground.height).obstacles == ()
 
 
-def test_crashes_begin_a_little_before_the_obstacle_and_on_the_road(experiment):
+def test_crashes_start_just_before_the_obstacle_and_on_the_road(experiment):
     for name, other in (("frontal", "barrier"), ("pole", "pole")):
         made = experiment(name, objects=["car_red"])
         pose = made.options.objects["car_red"].T_world_object
@@ -125,20 +127,20 @@ def test_crashes_begin_a_little_before_the_obstacle_and_on_the_road(experiment):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "other"), [("frontal", "barrier"), ("pole", "pole")])
-def test_a_car_is_driven_into_what_stands_on_the_road(experiment, rollout, name, other):
+def test_a_car_is_driven_into_an_object_on_the_road(experiment, rollout, name, other):
     result = rollout(experiment(name, objects=["car_red"]), 0.15)
     assert 0.04 < first_touch(result, other=other) < 0.12
 
 
 @pytest.mark.slow
-def test_a_t_bone_meets_a_side_and_a_roof_crash_the_road(experiment, rollout):
+def test_a_t_bone_hits_a_side_and_a_roof_crash_hits_the_road(experiment, rollout):
     result = rollout(experiment("t_bone", objects=["car_red", "car_blue"]), 0.15)
     assert 0.03 < first_touch(result, other="car_blue") < 0.12
     turned = experiment("roof", objects=["car_red"])
     assert 0.03 < first_touch(rollout(turned, 0.12), other="ground") < 0.1
 
 
-def test_how_it_is_filmed_is_kept(experiment, tiny_scene, tmp_path):
+def test_camera_settings_are_kept(experiment, tiny_scene, tmp_path):
     plan = FilmPlan.of(experiment("frontal", objects=["car_red"]), tiny_scene.ground.height)
     plan.save(tmp_path)
     kept = FilmPlan.load(tmp_path)
@@ -149,7 +151,7 @@ def test_how_it_is_filmed_is_kept(experiment, tiny_scene, tmp_path):
         FilmPlan.load(tmp_path / "nowhere")
 
 
-def test_a_t_bone_is_filmed_along_with_what_is_struck(experiment, tiny_scene, tmp_path):
+def test_a_t_bone_is_filmed_together_with_the_struck_vehicle(experiment, tiny_scene, tmp_path):
     made = experiment("t_bone", objects=["car_red", "car_blue"])
     FilmPlan.of(made, tiny_scene.ground.height).save(tmp_path)
     plan = FilmPlan.load(tmp_path)
@@ -168,16 +170,14 @@ def test_a_t_bone_is_filmed_along_with_what_is_struck(experiment, tiny_scene, tm
     assert views(playback, FilmPlan.load(tmp_path))[1].moved is None
 
 
-def test_the_side_of_a_roof_that_comes_down_first_is_filmed(experiment):
+def test_a_roof_crash_is_filmed_from_the_side_that_lands_first(experiment):
     made = experiment("roof", objects=["car_red"])
     pose = made.options.objects["car_red"].T_world_object
     lower = pose[:3, 1] * -np.sign(pose[2, 1])
     assert lower @ made.side > 0.3
 
 
-def test_what_takes_no_part_is_left_out_where_it_would_stand_before_the_camera(
-    tiny_scene, experiment, rollout
-):
+def test_bystanders_blocking_the_camera_are_left_out(tiny_scene, experiment, rollout):
     made = experiment("wall", objects=["car_red"])
     playback = Playback(tiny_scene, ScenarioState.of(tiny_scene), rollout(made, 0.01))
     near = views(playback, FilmPlan.of(made, tiny_scene.ground.height))[1]

@@ -41,7 +41,7 @@ def shell_cloud(*, sides="all", step=0.05, size=SIZE) -> GaussianCloud:
 
 
 @pytest.mark.parametrize("sides", ["all", "no underside"])
-def test_a_shell_is_filled_to_the_volume_of_its_box(sides):
+def test_a_shell_is_filled_to_its_box_volume(sides):
     filling = fill_object(shell_cloud(sides=sides), SIZE, spacing=0.05, mass=320.0)
     particles = filling.particles
     assert particles.volumes.sum() == pytest.approx(1.6, rel=0.12)
@@ -52,7 +52,7 @@ def test_a_shell_is_filled_to_the_volume_of_its_box(sides):
     assert filling.sealed == (() if sides == "all" else ("-z",))
 
 
-def test_gaussians_are_particles_and_the_rest_is_fill():
+def test_gaussians_become_particles_and_the_rest_is_fill():
     cloud = shell_cloud()
     particles = fill_object(cloud, SIZE, spacing=0.05).particles
     own = particles.source >= 0
@@ -64,7 +64,7 @@ def test_gaussians_are_particles_and_the_rest_is_fill():
     assert np.median(depth) > 0.1
 
 
-def test_haze_and_strays_are_no_matter():
+def test_haze_and_strays_are_not_matter():
     cloud = shell_cloud()
     faint = GaussianCloud(
         cloud.means, cloud.quats, cloud.scales, torch.full_like(cloud.opacities, 0.01), cloud.sh
@@ -78,7 +78,7 @@ def test_haze_and_strays_are_no_matter():
     assert both.particles.source.max() < len(cloud)
 
 
-def test_mass_comes_from_the_category_when_none_is_given():
+def test_mass_defaults_to_that_of_the_category():
     assert default_mass("car", (4.87, 1.85, 1.47)) == pytest.approx(1655, rel=0.01)
     particles = fill_object(shell_cloud(), SIZE, spacing=0.1, category="car").particles
     assert particles.mass == pytest.approx(default_mass("car", SIZE))
@@ -90,22 +90,22 @@ def test_mass_comes_from_the_category_when_none_is_given():
         ("pedestrian", (0.5, 0.33, 1.75), 78.0),
         ("pedestrian", (0.9, 0.9, 1.75), 78.0),  # as wide as a box tracked while walking
         ("pedestrian", (0.5, 0.5, 1.1), 24.4),  # six years: 20.6 kg by the CDC's growth charts
-        ("pedestrian", (1.0, 1.0, 3.0), 108.9),  # no more than of two metres
+        ("pedestrian", (1.0, 1.0, 3.0), 108.9),  # no more than for a height of two metres
         ("cyclist", (1.9, 0.9, 1.75), 92.0),
         ("motorcyclist", (2.2, 1.0, 1.75), 278.0),
     ],
 )
-def test_people_weigh_by_their_height(category, size, mass):
+def test_peoples_mass_depends_on_their_height(category, size, mass):
     assert default_mass(category, size) == pytest.approx(mass, abs=0.1)
 
 
 @pytest.mark.parametrize("options", [{"spacing": 0}, {"spacing": 0.1, "mass": -1.0}])
-def test_nonsense_is_refused(options):
+def test_invalid_arguments_are_refused(options):
     with pytest.raises(ParticleError, match="must be positive"):
         fill_object(shell_cloud(), SIZE, **options)
 
 
-def test_too_fine_a_spacing_is_refused_by_memory():
+def test_a_spacing_that_needs_too_much_memory_is_refused():
     with pytest.raises(ParticleError, match="GiB"):
         fill_object(shell_cloud(), SIZE, spacing=1e-4)
 

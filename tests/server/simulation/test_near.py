@@ -1,4 +1,4 @@
-"""What comes near a body is found on flat sides too, and when it is the other that moves."""
+"""Approaches are detected on flat sides too, and when the other body is the one moving."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ SHAPES = {
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_round_posts_and_fences_are_met_refused_within_and_carry(shape):
+def test_round_posts_and_fences_collide_carry_and_are_refused_inside_objects(shape):
     body = block(speed=10.0)
     simulated = simulator(body, SHAPES[shape](at(1.0, 0.22, 0)))
     for _ in range(20):
@@ -76,7 +76,7 @@ def test_round_posts_and_fences_are_met_refused_within_and_carry(shape):
     require_separation([still], [(still.T_world_object, SIZE)], [SHAPES[shape](at(0.68, 0.03, 0))])
 
 
-def test_what_is_let_fall_on_a_sheet_comes_to_rest_on_it():
+def test_an_object_dropped_on_a_sheet_comes_to_rest_on_it():
     flat = [[-2, -2, 0], [2, -2, 0], [2, 2, 0], [-2, 2, 0]]
     table = TriangleMesh(
         name="table",
@@ -94,7 +94,7 @@ def test_what_is_let_fall_on_a_sheet_comes_to_rest_on_it():
 
 
 @pytest.mark.parametrize("side", [-0.31, 0.04, 0.22])
-def test_a_thin_post_before_a_flat_front_is_met(side):
+def test_a_thin_post_in_front_of_a_flat_face_is_hit(side):
     body = block(speed=10.0)
     simulated = simulator(body, post(1.0, side))
     for _ in range(20):
@@ -104,7 +104,7 @@ def test_a_thin_post_before_a_flat_front_is_met(side):
     assert body.motion.velocity[0] < 3.0
 
 
-def test_a_collider_that_moves_wakes_what_stands_in_its_way():
+def test_a_moving_collider_wakes_what_stands_in_its_way():
     body = block()
     simulated = simulator(body, post(1.5, velocity=(-20, 0, 0)))
     assert body.mode == BodyMode.SLEEPING
@@ -113,7 +113,7 @@ def test_a_collider_that_moves_wakes_what_stands_in_its_way():
     assert body.motion.velocity[0] < -3.0
 
 
-def test_what_moves_away_or_past_is_not_near():
+def test_bodies_moving_away_are_not_near():
     body = block()
     simulated = simulator(body, post(1.0, velocity=(5, 0, 0)))
     for _ in range(4):
@@ -122,18 +122,18 @@ def test_what_moves_away_or_past_is_not_near():
 
 
 @pytest.mark.parametrize("width", [0.02, 0.3])
-def test_a_post_within_an_object_is_refused(width):
+def test_a_post_inside_an_object_is_refused(width):
     body = block()
     with pytest.raises(PhysicsError, match="inside collider 'post'"):
         require_separation([body], [(body.T_world_object, SIZE)], [post(0.0, 0.03, width)])
 
 
-def test_a_post_beside_an_object_is_not_refused():
+def test_a_post_beside_an_object_is_accepted():
     body = block()
     require_separation([body], [(body.T_world_object, SIZE)], [post(0.62, 0.03)])
 
 
-def test_what_comes_near_stays_rigid_until_surfaces_meet():
+def test_approaching_bodies_stay_rigid_until_surfaces_meet():
     body = block(speed=2.0)
     simulated = simulator(body, post(1.0, 0.04))
     ahead = 1.0 - 0.025 - SIZE[0] / 2
@@ -145,8 +145,8 @@ def test_what_comes_near_stays_rigid_until_surfaces_meet():
     assert body.mode == BodyMode.DEFORMING
 
 
-def test_what_only_turns_strikes_with_its_end():
-    """The end of a beam that turns about its middle comes at a block, neither of which moves on."""
+def test_a_spinning_beam_strikes_with_its_end():
+    """The end of a beam spinning about its middle strikes a block; neither is translating."""
     beam = block()
     beam.motion = replace(beam.motion, angular_velocity=np.array([0.0, 0.0, 4.0]))
     other = block(position=(0.55, 1.15, 0.0))

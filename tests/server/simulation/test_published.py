@@ -1,4 +1,4 @@
-"""The vehicle preset against published crash figures."""
+"""The vehicle preset compared with published crash figures."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ def test_published_figures_are_met(name):
         assert check.passed, check
 
 
-def test_a_front_gives_way_over_time_as_in_the_barrier_test():
-    # The pulse alone: what is straightened again afterwards needs half a second more.
+def test_the_front_crushes_over_time_as_in_the_barrier_test():
+    # The pulse alone: straightening afterwards would take half a second more.
     checks = malibu_checks(barrier_test(MALIBU_SPEED, "cpu", duration=0.13))
     assert [c.name for c in checks[:3] if not c.passed] == []
 
@@ -58,7 +58,7 @@ def test_a_front_gives_way_over_time_as_in_the_barrier_test():
         ({"energy_peak": 1.02}, "largest energy over the first"),
     ],
 )
-def test_a_crash_unlike_the_published_one_fails_its_check(changes, name):
+def test_a_crash_unlike_the_published_one_fails_the_check(changes, name):
     assert all(check.passed for check in malibu_checks(MALIBU))
     wrong = malibu_checks(replace(MALIBU, **changes))
     assert [check.name for check in wrong if not check.passed] == [name]
@@ -77,5 +77,5 @@ def test_each_side_of_a_vehicle_is_weaker_than_its_core(category):
     for place in ((2.9, 0, -0.5), (-2.9, 0, -0.5), (0, 0.9, -0.5), (0, -0.9, -0.5), (0, 0, 0.7)):
         assert young(*place) < core, place
     assert particles.mass == pytest.approx(1800.0)
-    # What is above the belt weighs little: the centre of mass lies below the middle.
+    # The part above the beltline is light, so the centre of mass is below the middle.
     assert particles.centre_of_mass[2] < -0.1

@@ -1,4 +1,4 @@
-"""A wanted restitution is reached where the body hits, and what was reached is told."""
+"""A requested restitution is reached where the body hits, and the result is reported."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def wall(kind: str, turn: np.ndarray, phase: float) -> Collider:
 def bounced(
     requested: float, phase: float, turn: np.ndarray, kind: str
 ) -> tuple[Rebound, float, dict]:
-    """What the fit says, separation over approach speed in a simulation, and what it says of it."""
+    """The fit's result, simulated separation over approach speed, and the reported restitution."""
     body, met = block(turn, ahead=0.5 + phase * CELL), wall(kind, turn, phase)
     body.rebound = fit_rebound(body, requested, [met], np.zeros(3))
     options = SimulateOptions(
@@ -72,7 +72,7 @@ def bounced(
 
 
 @pytest.mark.parametrize(("kind", "phase", "turn"), [("plane", 0.35, 1), ("box", 0.7, 0)])
-def test_it_is_reached_wherever_the_wall_is_and_however_it_is_turned(kind, phase, turn):
+def test_restitution_is_reached_for_any_wall_position_and_orientation(kind, phase, turn):
     fit, seen, bounce = bounced(0.3, phase, rotation_of(np.array(TURNS[turn])), kind)
     assert seen == pytest.approx(0.3, abs=0.03)
     assert fit.achieved == pytest.approx(0.3, abs=0.03)
@@ -80,7 +80,7 @@ def test_it_is_reached_wherever_the_wall_is_and_however_it_is_turned(kind, phase
     assert fit.speed == pytest.approx(SPEED)
 
 
-def test_more_than_the_grid_gives_back_is_given_when_they_part():
+def test_restitution_above_the_grids_own_is_added_at_separation():
     fit, seen, bounce = bounced(0.7, 0.35, rotation_of(np.array(TURNS[1])), "plane")
     assert fit.achieved == fit.elastic < 0.6
     assert bounce["grid"] == pytest.approx(fit.elastic, abs=0.05)
@@ -94,11 +94,11 @@ def test_more_than_the_grid_gives_back_is_given_when_they_part():
     [(0.15, 0.98, 1.8, 0.9), (0.0, 0.98, 1.8, 0.9), (0.0, None, 1.75, 0.78)],
     ids=["spaced", "touching", "touching, none requested"],
 )
-def test_balls_of_a_cradle_hand_on_what_they_have(gap, requested, last, kept):
+def test_newtons_cradle_passes_momentum_on(gap, requested, last, kept):
     """Three blocks in a row; the first flies at the second.
 
-    Of elastic cubes that touch, the last leaves at 1.75 of 2 m/s and 0.79 of the energy stays in
-    motion by finite elements; the grid of 0.2 m alone gives 0.9 and 0.37.
+    For touching elastic cubes, finite elements give the last one 1.75 of 2 m/s, with 0.79 of the
+    energy still in motion; the 0.2 m grid alone gives 0.9 and 0.37.
     """
     turn = rotation_of(np.array([0.0, np.pi / 2, 0.0]))
     bodies = []
@@ -126,7 +126,7 @@ def test_balls_of_a_cradle_hand_on_what_they_have(gap, requested, last, kept):
 @pytest.mark.slow
 @pytest.mark.parametrize("requested", [0.1, 0.3, 0.5, 0.7])
 @pytest.mark.parametrize("turn", TURNS)
-def test_it_is_reached_at_any_phase(requested, turn):
+def test_restitution_is_reached_at_any_grid_phase(requested, turn):
     for phase in np.arange(20) / 20:
         _, seen, bounce = bounced(requested, phase, rotation_of(np.array(turn)), "plane")
         assert seen == pytest.approx(requested, abs=0.05)
@@ -143,7 +143,7 @@ def test_a_falling_body_is_followed_to_the_ground():
     assert touch.point[2] == pytest.approx(0.0, abs=1e-9)
 
 
-def test_who_meets_nothing_is_fitted_on_a_wall_across_its_way():
+def test_a_body_that_hits_nothing_is_fitted_against_a_wall_across_its_path():
     body = block(np.eye(3), ahead=1.0)
     fit = fit_rebound(body, 0.2, [], np.zeros(3))
     assert fit.other is None

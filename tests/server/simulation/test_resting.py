@@ -1,4 +1,4 @@
-"""What has settled is carried by rigid contacts: it neither sinks nor creeps nor flips."""
+"""Settled bodies are carried by rigid contacts: they do not sink, creep or flip."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def simulator(*bodies: DeformableBody) -> HybridSimulator:
 
 
 def run(world: HybridSimulator, seconds: float) -> int:
-    """Go on, and count how often bodies begin to deform."""
+    """Continue, and count how often bodies start to deform."""
     begun, modes = 0, [b.mode for b in world.bodies]
     for _ in range(round(seconds / STEP)):
         world.advance(STEP)
@@ -61,12 +61,12 @@ def places(world: HybridSimulator) -> np.ndarray:
 
 
 def dropped(offset: float) -> HybridSimulator:
-    """Three boxes above each other, each 6 cm above the next, the second to a side."""
+    """Three boxes stacked with 6 cm gaps, the second one offset sideways."""
     aside = {"a": 0.0, "b": offset, "c": 0.0}
     return simulator(*(box(n, at(x, 0, 0.36 + 0.66 * k)) for k, (n, x) in enumerate(aside.items())))
 
 
-def test_a_stack_that_falls_onto_itself_comes_to_rest():
+def test_a_collapsing_stack_comes_to_rest():
     world = dropped(0.02)
     assert run(world, 0.5) == 3
     settled = places(world)
@@ -79,7 +79,7 @@ def test_a_stack_that_falls_onto_itself_comes_to_rest():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("offset", [0.0, 0.02, 0.05])
-def test_stacks_stay_for_five_seconds(offset):
+def test_stacks_stay_put_for_five_seconds(offset):
     world = dropped(offset)
     run(world, 1.0)
     settled = places(world)
@@ -102,14 +102,14 @@ def test_the_ground_and_each_box_carry_what_is_above():
         assert np.abs([body.motion.velocity, body.motion.angular_velocity]).max() < 5e-3
 
 
-def test_a_box_slides_as_far_as_friction_lets_it():
+def test_a_box_slides_as_far_as_friction_allows():
     world = simulator(box("box", at(0, 0, SIDE / 2), (3.0, 0.0, 0.0)))
     run(world, 1.0)
     assert places(world)[0, 0] == pytest.approx(3.0**2 / (2 * MU * 9.81), rel=0.08)
     assert world.bodies[0].mode == BodyMode.SLEEPING
 
 
-def test_what_topples_over_ends_flat_on_the_ground():
+def test_a_toppled_box_ends_flat_on_the_ground():
     leant = np.eye(4)
     leant[:3, :3] = rotation_of(np.array([0.0, np.radians(65), 0.0]))
     leant[2, 3] = SIDE * np.sqrt(0.5) * np.cos(np.radians(20))
@@ -121,8 +121,8 @@ def test_what_topples_over_ends_flat_on_the_ground():
     assert places(world)[0, 2] == pytest.approx(SIDE / 2, abs=0.02)
 
 
-def test_a_collider_that_comes_slowly_moves_what_rests():
-    """A wall that is slower than what contacts bear pushes a box that sleeps."""
+def test_a_slow_collider_moves_a_resting_box():
+    """A wall moving too slowly to break contacts pushes a sleeping box."""
     world = simulator(box("box", at(0, 0, SIDE / 2)))
     run(world, 0.05)
     wall = Box(name="wall", T_world_box=at(-0.45, 0, 0.3), size=(0.2, 2, 0.6), velocity=(0.1, 0, 0))
@@ -134,7 +134,7 @@ def test_a_collider_that_comes_slowly_moves_what_rests():
 
 @pytest.mark.slow
 def test_a_car_on_a_car_comes_to_rest():
-    """One vehicle dropped onto the roof of another: five seconds, less than 1 mm/s at their end."""
+    """One vehicle dropped onto another's roof: after five seconds, below 1 mm/s."""
     world = simulator(car("under", 0.0, 0.75), car("over", 0.3, 2.2))
     run(world, 4.0)
     settled = places(world)
@@ -161,7 +161,7 @@ def car(name: str, x: float, height: float) -> DeformableBody:
     )
 
 
-def test_what_a_wall_is_still_stopping_has_not_come_to_rest_against_it():
+def test_a_body_still_being_stopped_by_a_wall_is_not_at_rest():
     """A soft body that hits slowly is slow and keeps its shape long before it bounces."""
     wall = Plane(name="wall", point=(SIDE / 2, 0, 0), normal=(-1, 0, 0))
     body = box("body", at(0, 0, 0), velocity=(0.2, 0.0, 0.0))

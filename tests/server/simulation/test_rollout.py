@@ -42,7 +42,7 @@ def fall() -> SimulationResult:
     return simulate_bodies([body], options(body, colliders=[ground], duration=2.5))
 
 
-def test_it_falls_freely_then_deforms_then_rests(fall):
+def test_a_body_falls_freely_then_deforms_then_rests(fall):
     modes = fall.objects["box"].modes
     assert modes[1] == BodyMode.RIGID
     assert BodyMode.DEFORMING in modes
@@ -50,27 +50,27 @@ def test_it_falls_freely_then_deforms_then_rests(fall):
     assert fall.objects["box"].positions[-1, 2] == pytest.approx(0.3, abs=0.06)
 
 
-def test_first_contact_is_when_a_free_fall_gets_there(fall):
+def test_first_contact_matches_free_fall(fall):
     [contact] = fall.contacts
     assert contact.other == "ground"
     assert contact.first_s == pytest.approx(np.sqrt(2 * 1.2 / 9.81), abs=0.06)
 
 
-def test_the_ground_gives_back_the_momentum_of_the_whole_fall(fall):
+def test_the_ground_impulse_equals_the_momentum_of_the_fall(fall):
     own = fall.objects["box"]
     wanted = own.mass * 9.81 * fall.times_s[-1]
-    # Nothing is logged while it sleeps: the ground then carries the weight without an impulse.
+    # Nothing is logged while it sleeps: the ground carries the weight without an impulse.
     asleep = fall.times_s[np.argmax(own.modes == BodyMode.SLEEPING)]
     given = fall.impulses[-1, 0, 2] + own.mass * 9.81 * (fall.times_s[-1] - asleep)
     assert given == pytest.approx(wanted, rel=0.03)
 
 
-def test_no_frame_has_more_energy_than_the_first(fall):
+def test_energy_never_exceeds_that_of_the_first_frame(fall):
     total = fall.energies[:, :3].sum(axis=1)
     assert total.max() <= total[0] * (1 + 1e-6)
 
 
-def test_a_result_comes_back_from_disk_as_it_was(fall, tmp_path):
+def test_a_result_round_trips_through_disk(fall, tmp_path):
     fall.save(tmp_path / "run")
     again = SimulationResult.load(tmp_path / "run")
     assert again.contacts == fall.contacts
@@ -83,7 +83,7 @@ def test_a_result_comes_back_from_disk_as_it_was(fall, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_moving_body_hits_a_standing_one_and_both_part():
+def test_a_moving_body_hits_a_standing_one_and_they_separate():
     striker = box("striker", (0, 0, 0), (2.0, 0, 0))
     struck = box("struck", (0.9, 0, 0))
     result = simulate_bodies(
@@ -98,7 +98,7 @@ def test_a_moving_body_hits_a_standing_one_and_both_part():
     assert delta["struck"] == pytest.approx(after["struck"], abs=1e-3)
 
 
-def test_a_cancelled_rollout_keeps_what_was_made():
+def test_a_cancelled_rollout_keeps_its_finished_frames():
     body = box(position=(0, 0, 9))
     calls = []
     result = simulate_bodies(
@@ -112,7 +112,7 @@ def test_a_cancelled_rollout_keeps_what_was_made():
     assert calls == [(1, 10), (2, 10), (3, 10)]
 
 
-def test_the_same_rollout_gives_the_same_bits():
+def test_a_rollout_is_reproducible():
     def run():
         body = box(position=(0, 0, 0.5), velocity=(1.0, 0, -2.0))
         ground = Plane(name="ground", friction=0.7)
@@ -134,6 +134,6 @@ def test_the_same_rollout_gives_the_same_bits():
         ({"brake_after_hit": 2.0}, "brake_after_hit"),
     ],
 )
-def test_nonsense_is_refused(changes, message):
+def test_invalid_arguments_are_refused(changes, message):
     with pytest.raises(PhysicsError, match=message):
         SimulateOptions(**{"objects": {"box": ObjectPhysics()}, **changes})

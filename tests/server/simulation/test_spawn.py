@@ -1,4 +1,4 @@
-"""What cannot be simulated is refused with the reason, before anything is simulated."""
+"""Invalid setups are refused with the reason before simulation starts."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ GROUND = Plane(name="ground", friction=0.7)
 
 @pytest.fixture
 def rollout(tiny_scene):
-    """Simulates a little of a scene, by default of the tiny one with its red car."""
+    """Simulates a short part of a scene, by default the tiny one with its red car."""
 
     def run(objects=None, *, scene=tiny_scene, **changes):
         objects = {"car_red": ObjectPhysics()} if objects is None else objects
@@ -40,7 +40,7 @@ def rollout(tiny_scene):
         ({"T_world_object": np.diag([2.0, 1, 1, 1])}, "must be rigid"),
     ],
 )
-def test_nonsense_of_one_object_is_refused_by_name(rollout, physics, message):
+def test_invalid_settings_of_an_object_are_refused_by_name(rollout, physics, message):
     with pytest.raises(PhysicsError, match=message):
         rollout({"car_red": ObjectPhysics(**physics)})
 
@@ -54,12 +54,12 @@ def test_nonsense_of_one_object_is_refused_by_name(rollout, physics, message):
         ({"brake": np.nan}, r"brake of an object must be in \[0, 1\]"),
     ],
 )
-def test_numbers_out_of_range_are_refused_at_once(physics, message):
+def test_out_of_range_numbers_are_refused_immediately(physics, message):
     with pytest.raises(PhysicsError, match=message):
         ObjectPhysics(**physics)
 
 
-def test_objects_that_start_inside_each_other_are_named(rollout):
+def test_objects_that_start_overlapping_are_named(rollout):
     here = {"T_world_object": at(8.0, 0.0, 0.75)}
     with pytest.raises(PhysicsError, match=r"'car_red' and 'car_blue' are .* inside each other"):
         rollout({"car_red": ObjectPhysics(**here), "car_blue": ObjectPhysics()})
@@ -77,12 +77,12 @@ def test_an_object_that_starts_inside_a_wall_is_named(rollout):
         rollout(colliders=[GROUND, wall])
 
 
-def test_names_that_are_given_twice_are_refused(rollout):
+def test_duplicate_names_are_refused(rollout):
     with pytest.raises(PhysicsError, match=r"must be unique; \['ground'\]"):
         rollout(colliders=[GROUND, GROUND])
 
 
-def test_bodies_share_the_particles_there_may_be(rollout):
+def test_bodies_share_the_particle_budget(rollout):
     whole, fewer = rollout(), rollout(max_particles=800)
     assert fewer.figures["particles"] <= 800 < whole.figures["particles"]
     assert fewer.figures["cell"] > whole.figures["cell"]
@@ -94,7 +94,7 @@ def test_too_few_particles_to_deform_are_refused(rollout):
         rollout(max_particles=100)
 
 
-def test_a_thing_of_ten_million_particles_is_filled_more_coarsely(rollout, tiny_scene):
+def test_an_object_of_ten_million_particles_is_filled_more_coarsely(rollout, tiny_scene):
     scene = tiny_scene
     huge = replace(scene.objects["car_red"], size=(40.0, 18.0, 15.0))
     scene = replace(scene, objects=dict(scene.objects) | {"car_red": huge})
@@ -102,7 +102,7 @@ def test_a_thing_of_ten_million_particles_is_filled_more_coarsely(rollout, tiny_
     assert result.figures["particles"] <= 20_000
 
 
-def test_mass_by_density_does_not_depend_on_the_particles(rollout):
+def test_mass_from_density_does_not_depend_on_the_particles(rollout):
     masses = [
         rollout(preset="paper", colliders=[], max_particles=most).objects["car_red"].mass
         for most in (100_000, 4_000, 1_000)
@@ -111,7 +111,7 @@ def test_mass_by_density_does_not_depend_on_the_particles(rollout):
 
 
 @pytest.mark.parametrize(("category", "stability"), [("car", 1.41), ("van", 1.12)])
-def test_the_centre_of_mass_of_vehicles_is_as_high_as_published(tiny_scene, category, stability):
+def test_vehicles_centre_of_mass_height_matches_published_values(tiny_scene, category, stability):
     red = next(o for o in ScenarioState.of(tiny_scene).visible if o.object_id == "car_red")
     subject = replace(red, category=category)
     particles = object_particles(tiny_scene, subject, preset_of("vehicle"), 0)
@@ -120,7 +120,7 @@ def test_the_centre_of_mass_of_vehicles_is_as_high_as_published(tiny_scene, cate
     assert particles.masses.min() > 0
 
 
-def test_its_structure_does_not_move_the_centre_of_mass_of_a_vehicle(tiny_scene):
+def test_a_vehicles_structure_does_not_move_its_centre_of_mass(tiny_scene):
     state, preset = ScenarioState.of(tiny_scene), preset_of("vehicle")
     red = next(o for o in state.visible if o.object_id == "car_red")
     (body,) = spawn_bodies(
@@ -138,7 +138,7 @@ def test_its_structure_does_not_move_the_centre_of_mass_of_a_vehicle(tiny_scene)
     assert body.rest.centre_of_mass[2] == pytest.approx(height, abs=1e-3)
 
 
-def test_particles_of_vehicles_alone_are_further_apart(tiny_scene):
+def test_only_vehicles_have_coarser_particles(tiny_scene):
     preset = preset_of("vehicle")
     red = next(o for o in ScenarioState.of(tiny_scene).visible if o.object_id == "car_red")
     cone = replace(red, category="cone")

@@ -1,4 +1,4 @@
-"""A body stands where forces of its contacts hold it, and nowhere else."""
+"""A body stands only where its contact forces hold it."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def block(pose, size=(0.6, 0.4, 0.4), *, name="block", friction=MU, **options) -
 
 
 def slope(degrees: float) -> tuple[np.ndarray, Plane]:
-    """A frame whose x axis goes down a slope through the origin, and the slope."""
+    """A frame whose x axis points down a slope through the origin, and the slope."""
     frame = np.eye(4)
     frame[:3, :3] = rotation_of(np.array([0.0, math.radians(degrees), 0.0]))
     return frame, Plane(name="ground", normal=frame[:3, 2])
@@ -83,7 +83,7 @@ def sleeps(body: DeformableBody, *colliders: Collider) -> bool:
 
 
 @pytest.mark.parametrize("off", [-10, -3, -1, 1, 3, 10])
-def test_a_block_stands_on_a_slope_up_to_the_angle_of_friction(off):
+def test_a_block_stands_on_a_slope_up_to_the_friction_angle(off):
     frame, ground = slope(FRICTION_ANGLE + off)
     assert sleeps(block(frame @ at(0, 0, 0.2)), ground) == (off < 0)
 
@@ -96,18 +96,18 @@ def test_a_slender_block_stands_up_to_the_angle_at_which_it_tips(off):
 
 
 @pytest.mark.parametrize("beyond", [-0.1, -0.02, 0.02, 0.6])
-def test_a_beam_stands_while_its_centre_is_over_the_table(beyond):
+def test_a_beam_stays_while_its_centre_is_over_the_table(beyond):
     table = Box(name="table", T_world_box=at(-1, 0, -0.5), size=(2, 2, 1))
     beam = block(at(beyond, 0, 0.1), (2.0, 0.4, 0.2))
     assert sleeps(beam, table) == (beyond < 0)
 
 
 @pytest.mark.parametrize(("height", "stands"), [(0.0, True), (0.05, False), (0.3, False)])
-def test_what_touches_nothing_does_not_stand(height, stands):
+def test_a_body_that_touches_nothing_does_not_stand(height, stands):
     assert sleeps(block(at(0, 0, 0.2 + height)), GROUND) == stands
 
 
-def test_a_box_on_a_steep_slope_slides_as_coulomb_has_it():
+def test_a_box_on_a_steep_slope_slides_by_coulombs_law():
     frame, ground = slope(60)
     box = block(frame @ at(0, 0, 0.2), friction=0.1)
     simulated = simulator(box, colliders=[ground])
@@ -118,7 +118,7 @@ def test_a_box_on_a_steep_slope_slides_as_coulomb_has_it():
     assert (box.motion.centre - start) @ frame[:3, 0] == pytest.approx(pull * 0.02, rel=0.1)
 
 
-def test_a_car_above_the_road_falls_on_its_wheels():
+def test_a_car_above_the_road_falls_onto_its_wheels():
     above = car(height=0.35)
     simulated = simulator(above, colliders=[GROUND])
     assert above.mode == BodyMode.RIGID
@@ -127,7 +127,7 @@ def test_a_car_above_the_road_falls_on_its_wheels():
     assert above.motion.centre[2] < car(height=0.25).motion.centre[2]
 
 
-def test_a_car_stands_on_a_slope_as_far_as_its_tyres_hold():
+def test_a_car_stands_on_a_slope_as_long_as_its_tyres_hold():
     for percent, stands in ((68, True), (72, False), (80, False)):
         frame, ground = slope(math.degrees(math.atan(percent / 100)))
         assert sleeps(car(frame), ground) == stands
@@ -138,18 +138,18 @@ def test_a_car_stands_on_a_slope_as_far_as_its_tyres_hold():
     for _ in range(400):
         simulated.advance(0.005)
         speeds.append(sliding.motion.velocity @ frame[:3, 0])
-    # In the first second its springs take up the slope.
+    # In the first second its springs adjust to the slope.
     angle = math.atan(0.8)
     pull = 9.81 * (math.sin(angle) - 0.7 * math.cos(angle))
     assert speeds[-1] - speeds[199] == pytest.approx(pull, rel=0.1)
 
 
-def test_what_rests_on_something_that_moves_does_not_sleep():
+def test_a_body_on_a_moving_support_does_not_sleep():
     table = Box(name="table", T_world_box=at(0, 0, -0.5), size=(2, 2, 1), velocity=(0, 0, -5))
     assert not sleeps(block(at(0, 0, 0.2)), table)
 
 
-def test_a_body_wakes_when_what_carries_it_is_taken_away():
+def test_a_body_wakes_when_its_support_is_removed():
     low, high = block(at(0, 0, 0.2), name="low"), block(at(0, 0, 0.6), name="high")
     simulated = simulator(low, high, colliders=[GROUND])
     assert low.mode == high.mode == BodyMode.SLEEPING

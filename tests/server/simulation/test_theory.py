@@ -1,4 +1,4 @@
-"""Bodies of a simulation against theory, as ``real2sim validate`` has them."""
+"""Simulated bodies compared with theory, as in ``real2sim validate``."""
 
 from __future__ import annotations
 
@@ -12,6 +12,6 @@ SLOW = {"thin_post"}
 @pytest.mark.parametrize(
     "name", [pytest.param(n, marks=pytest.mark.slow) if n in SLOW else n for n in THEORY]
 )
-def test_theory_is_met(name):
+def test_simulation_agrees_with_theory(name):
     for check in THEORY[name]("cpu"):
         assert check.passed, check

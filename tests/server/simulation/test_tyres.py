@@ -26,7 +26,7 @@ def spinning() -> RigidMotion:
     )
 
 
-def test_a_free_rigid_body_keeps_its_angular_momentum_and_falls_like_a_stone():
+def test_a_free_rigid_body_keeps_angular_momentum_and_falls_freely():
     motion = spinning()
     spin = motion.angular_momentum
     height, speed = motion.centre[2], motion.velocity[2]
@@ -66,7 +66,7 @@ def drive(motion: RigidMotion, tyres: Tyres, seconds: float, *, dt=0.0025) -> Ri
     return motion
 
 
-def test_braking_from_10_metres_a_second_takes_the_distance_of_coulomb():
+def test_braking_distance_from_10_m_s_follows_coulombs_law():
     start, tyres = car(10.0, brake=1.0)
     end = drive(start, tyres, 3.0)
     assert end.centre[0] - start.centre[0] == pytest.approx(10**2 / (2 * 0.7 * 9.81), rel=0.03)
@@ -74,25 +74,25 @@ def test_braking_from_10_metres_a_second_takes_the_distance_of_coulomb():
     assert end.centre[2] == pytest.approx(start.centre[2], abs=0.02)
 
 
-def test_free_wheels_roll_on():
+def test_free_wheels_keep_rolling():
     start, tyres = car(10.0, brake=0.0)
     end = drive(start, tyres, 1.0)
     assert end.velocity[0] == pytest.approx(10 - 0.015 * 9.81, abs=0.05)
 
 
-def test_free_wheels_do_not_slip_sideways_below_their_grip():
+def test_free_wheels_do_not_slide_sideways_below_their_grip():
     start, tyres = car(0.0, brake=0.0)
     pushed = start.with_impulse(np.array([0, 1500 * 0.3, 0]), start.centre - [0, 0, 0.5])
     assert abs(drive(pushed, tyres, 1.0).velocity[1]) < 0.02
 
 
-def test_the_body_hangs_on_its_wheels_as_it_stands():
+def test_suspension_starts_at_rest():
     start, tyres = car(0.0, brake=1.0)
     end = drive(start, tyres, 2.0)
     np.testing.assert_allclose(end.centre, start.centre, atol=2e-3)
 
 
-def test_wheels_go_up_into_the_body_as_far_as_it_came_down():
+def test_wheels_move_into_the_body_as_far_as_it_sinks():
     size = (4.0, 1.8, 1.5)
     tyres = Tyres.of(size, np.zeros(3), 1e4)
     ground = Plane(name="ground")
@@ -102,7 +102,7 @@ def test_wheels_go_up_into_the_body_as_far_as_it_came_down():
     assert (tyres.lifts(at(0, 0, -3.0), [ground]) <= 0.3).all()
 
 
-def test_a_car_that_rolls_stays_rigid_and_loses_speed_by_rolling_resistance():
+def test_a_rolling_car_stays_rigid_and_slows_by_rolling_resistance():
     motion, tyres = car(10.0, brake=0.0)
     particles = box_particles((4.5, 1.8, 1.3), spacing=0.1, density=100).moved(at(0, 0, 0.1))
     rolling = DeformableBody(

@@ -1,4 +1,4 @@
-"""Only what can yield becomes particles; the rest stays rigid and takes back what it has given."""
+"""Only bodies that can yield become particles; the rest stay rigid and receive the reaction."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def simulator(*bodies, colliders=(), gravity=(0.0, 0.0, 0.0), **options):
 
 
 def run(world, seconds):
-    """Go on; which bodies have deformed."""
+    """Continue; returns which bodies have deformed."""
     deformed = set()
     for _ in range(round(seconds / STEP)):
         world.advance(STEP)
@@ -87,7 +87,7 @@ def test_a_truck_stays_rigid_and_throws_a_cone_forward():
     assert totals["truck", "cone"] == pytest.approx(-totals["cone", "truck"])
 
 
-def test_what_stands_is_pushed_by_what_it_stops():
+def test_a_standing_body_is_pushed_by_what_it_stops():
     bodies = truck(speed=0.0), cone(speed=-6.0)
     world = simulator(*bodies)
     assert bodies[0].mode == BodyMode.SLEEPING
@@ -109,11 +109,11 @@ def test_what_stands_is_pushed_by_what_it_stops():
     ],
     ids=["a cone", "a fast cone", "nearly as heavy", "what is only elastic", "a truck"],
 )
-def test_what_a_body_withstands(heavy, light, holds):
+def test_the_load_a_body_withstands(heavy, light, holds):
     assert withstands(heavy(), light(), np.zeros(3)) == holds
 
 
-def test_boxes_cover_what_may_be_touched_and_move_along():
+def test_boxes_cover_touchable_parts_and_move_along():
     moved = truck(spin=(0.0, 0.0, 1.0))
     (box,) = as_boxes(moved, cone())
     pose, size = np.asarray(box.T_world_box), np.asarray(box.size)
@@ -122,8 +122,8 @@ def test_boxes_cover_what_may_be_touched_and_move_along():
     assert box.velocity == pytest.approx([8.0 - pose[1, 3], pose[0, 3], 0.0])
 
 
-def test_colliders_move_once_a_step_beside_wheels():
-    """A solver that tyres have ended has moved them already."""
+def test_colliders_move_once_per_step_alongside_wheels():
+    """When the tyres end the solver, it has already moved them."""
     car = vehicle("car", (2.0, 1.0, 1.0), 500.0, at(0, 0, 0.5))
     far = Box(name="far", T_world_box=at(0, 50, 1), size=(1, 1, 1), velocity=(2.0, 0.0, 0.0))
     world = simulator(car, colliders=[Plane(name="ground"), far], gravity=(0.0, 0.0, -9.81))
@@ -134,7 +134,7 @@ def test_colliders_move_once_a_step_beside_wheels():
 
 
 def vehicle(category, size, mass, pose, *, name=None, velocity=REST, brake=0.0, spacing=0.1):
-    """A vehicle of the preset on its wheels, a box of particles from 12 cm above the road on."""
+    """A preset vehicle on its wheels: a box of particles starting 12 cm above the road."""
     length, width, height = size
     particles = box_particles((length, width, height - 0.12), spacing=spacing, density=100.0)
     particles = particles.moved(at(0, 0, 0.06)).with_mass(mass)
@@ -164,7 +164,7 @@ def truck_and_cone():
 
 
 def low_car(height: float, fall: float = 0.0):
-    """A car on its wheels whose floor hangs ``height`` [m] above the road, as after a crash."""
+    """A car on its wheels with its floor ``height`` [m] above the road, as after a crash."""
     car = vehicle("car", (3.0, 1.6, 1.2), 1000.0, at(0, 0, 0.6), velocity=(8.0, 0.0, -fall))
     lowered = car.rest.moved(at(0, 0, height - 0.12))
     return DeformableBody(
@@ -182,7 +182,7 @@ def low_car(height: float, fall: float = 0.0):
 
 
 @pytest.mark.parametrize("height", [0.02, -0.02])
-def test_a_floor_that_hangs_low_or_drags_does_not_deform(height):
+def test_a_low_or_dragging_floor_does_not_deform(height):
     car = low_car(height)
     world = simulator(car, colliders=GROUND, gravity=GRAVITY)
     assert run(world, 0.2) == set()
@@ -196,6 +196,6 @@ def test_a_floor_that_strikes_the_road_deforms():
 
 
 @pytest.mark.slow
-def test_a_cone_costs_a_truck_no_particles():
+def test_hitting_a_cone_needs_no_truck_particles():
     world = simulator(*truck_and_cone(), colliders=GROUND, gravity=GRAVITY)
     assert run(world, 1.0) == {"cone"}

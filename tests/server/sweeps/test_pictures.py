@@ -32,12 +32,12 @@ def test_a_blind_planner_is_shown_nothing(left_first):
     assert CameraFeed.of(left_first, Needs()) is None
 
 
-def test_modalities_that_sweeps_do_not_draw_are_named(left_first):
+def test_modalities_that_sweeps_do_not_render_are_named(left_first):
     with pytest.raises(ValueError, match="needs depth; sweeps only render rgb"):
         CameraFeed.of(left_first, Needs(modalities=("depth",)))
 
 
-def test_worlds_drawn_at_once_are_drawn_as_alone(left_first):
+def test_worlds_rendered_together_match_single_ones(left_first):
     world = begin(left_first, Drive("idm", {}), Needs(), privileged=False)
     later, planner = world.fork(), load_planner("idm")
     planner.reset(observation_of(later))

@@ -96,7 +96,7 @@ def test_a_blind_planner_is_at_fault_where_the_reference_is_not(evaluate):
     assert seen.impact["object"] == "car_blue"
 
 
-def test_the_reference_keeps_free_of_everybody_and_within_its_vehicle(scene, evaluate):
+def test_the_reference_avoids_everybody_within_vehicle_limits(scene, evaluate):
     drive = evaluate(0, [1.0, 1.0]).drive
     world = begin(scene, drive, Needs(), privileged=False)
     drove = drive_reference(world)
@@ -107,7 +107,7 @@ def test_the_reference_keeps_free_of_everybody_and_within_its_vehicle(scene, eva
     assert drove.world.accumulator.distance > 3.0
 
 
-def test_swerves_ask_for_no_more_than_tyres_give(scene):
+def test_swerves_stay_within_tyre_grip(scene):
     drive = Drive.of(BRAKES.case, "pid", 0)
     world = begin(scene, drive, Needs(), privileged=False)
     # Plans that brake to a stop end there at once; the vehicle does as its limits let it.
@@ -122,7 +122,7 @@ def test_swerves_ask_for_no_more_than_tyres_give(scene):
     assert math.hypot(SIDEWAYS, hardest) < 0.9 * 9.81
 
 
-def test_the_surrogate_goes_through_what_it_has_seen_and_doubts_what_it_has_not():
+def test_the_surrogate_fits_its_data_and_is_uncertain_elsewhere():
     rng = np.random.default_rng(0)
     points = rng.random((40, 2))
     values = np.sin(5.0 * points[:, 0])
@@ -161,7 +161,7 @@ def test_a_search_finds_what_one_in_hundreds_of_points_is_like():
     assert max(firsts) < 0.2 * math.log(2) / (4 / 3 * 0.13**3)
 
 
-def test_who_is_not_meant_by_a_case_does_not_hide_how_near_others_came(scene):
+def test_bystanders_do_not_hide_how_near_the_named_objects_came(scene):
     """Parked cars are nearer to the ego than the one that brakes far ahead."""
     near, far = (
         Drive("pid", {"agents": {"drivers": {"car_blue": {"kind": "hard_brake", "gap": gap}}}})
@@ -172,7 +172,7 @@ def test_who_is_not_meant_by_a_case_does_not_hide_how_near_others_came(scene):
     assert driven[0].criticality > driven[1].criticality
 
 
-def test_collisions_that_others_cause_are_no_end_of_a_search(scene):
+def test_collisions_caused_by_others_do_not_end_a_search(scene):
     world = begin(scene, Drive("pid", {}), Needs(), privileged=False)
     danger = Danger(adversaries_of({}))
     danger.add(world)
@@ -183,14 +183,14 @@ def test_collisions_that_others_cause_are_no_end_of_a_search(scene):
     assert danger.criticality(blamed) == pytest.approx(0.7)
 
 
-def test_a_case_is_about_those_that_it_names():
+def test_a_case_considers_only_the_objects_it_names():
     assert adversaries_of({}) == frozenset()
     board = {"entities": [{"name": "Van"}, {"name": "Ego2", "object_id": "car_1"}]}
     edits = [{"op": "scale", "object_id": "car_2"}, {"op": "relight"}]
     assert adversaries_of({"storyboard": board}, edits) == {"Van", "Van.story", "car_1", "car_2"}
 
 
-def test_searches_of_one_seed_are_the_same(evaluate):
+def test_searches_with_one_seed_are_identical(evaluate):
     pytest.importorskip("cmaes")
     one, again = (search(evaluate, SearchBudget(14, seed=3)) for _ in range(2))
     assert [e.point for e in one.evaluations] == [e.point for e in again.evaluations]
@@ -205,7 +205,7 @@ def test_a_search_may_end_with_the_first_failure(evaluate):
     assert state.evaluations[-1].is_failure
 
 
-def test_failures_are_written_as_cases_and_recordings_that_come_out_the_same(found, scene):
+def test_failures_are_saved_as_reproducible_cases_and_recordings(found, scene):
     report = json.loads((found / FAILURES).read_text())
     assert report["cells"] == len(report["failures"]) > 0
     for failure in report["failures"]:
@@ -222,7 +222,7 @@ def test_failures_are_written_as_cases_and_recordings_that_come_out_the_same(fou
         assert again.criticality == failure["criticality"]
 
 
-def test_the_page_says_what_was_found(found):
+def test_the_page_reports_what_was_found(found):
     page = (found / PAGE).read_text()
     report = json.loads((found / FAILURES).read_text())
     assert f"{report['avoidable']} avoidable collisions" in page
@@ -230,7 +230,7 @@ def test_the_page_says_what_was_found(found):
     assert "Probability of a collision at fault" in page
 
 
-def test_boundaries_lie_between_what_fails_and_what_does_not(evaluate):
+def test_boundaries_separate_failures_from_passes(evaluate):
     failure = evaluate(0, [1.0, 1.0])
     edges = boundaries(evaluate, failure)
     assert edges
@@ -265,7 +265,7 @@ def test_the_archive_keeps_the_worst_of_each_cell():
     assert archive.first == 7
 
 
-def test_the_interval_of_wilson_is_the_published_one():
+def test_the_wilson_interval_matches_published_values():
     found = wilson(81, 263)  # Newcombe 1998, table I: 0.2553 to 0.3662
     assert (found.low, found.high) == (
         pytest.approx(0.2553, abs=1e-4),
@@ -273,7 +273,7 @@ def test_the_interval_of_wilson_is_the_published_one():
     )
 
 
-def test_splitting_finds_a_probability_that_nobody_could_draw():
+def test_splitting_estimates_a_probability_too_small_to_sample():
     """Beyond 4 standard deviations along a diagonal: 3.2e-5."""
     truth = float(norm.sf(4.0))
     found = [
@@ -291,7 +291,7 @@ def test_splitting_finds_a_probability_that_nobody_could_draw():
     assert any(one.low <= truth <= one.high for one in found)
 
 
-def test_splitting_that_does_not_get_there_gives_an_upper_bound():
+def test_splitting_that_does_not_reach_failure_gives_an_upper_bound():
     found = splitting(lambda u: -1.0 - float(u.sum()), 2, particles=20, most_episodes=300)
     assert found.value == 0.0
     assert 0.0 < found.high < 1.0
@@ -310,5 +310,5 @@ def test_sobol_indices_find_the_parameter_that_matters():
 
 
 @pytest.mark.parametrize("name", sorted(p.stem for p in SHIPPED_SPACES.glob("*.yaml")))
-def test_shipped_spaces_are_spaces(name):
+def test_shipped_spaces_are_valid(name):
     assert load_space(name).case.name == name

@@ -38,7 +38,7 @@ CASE = {"name": "brakes", "scene": "tiny", "reset": BRAKES}
     ],
 )
 @given(u=units)
-def test_values_are_within_their_ends_and_lead_back_to_their_coordinate(parameter, u):
+def test_values_stay_in_range_and_map_back_to_their_coordinate(parameter, u):
     value = parameter.at(u)
     assert parameter.low - 1e-9 <= value <= parameter.high + 1e-9
     assert parameter.coordinate(value) == pytest.approx(u, abs=1e-6)
@@ -50,7 +50,7 @@ def test_whole_numbers_and_choices_are_those_allowed(u):
     assert Choice(kind="choice", values=["a", 2, True]).at(u) in ["a", 2, True]
 
 
-def test_every_whole_number_is_as_likely():
+def test_every_whole_number_is_equally_likely():
     drawn = [IntRange(kind="int", low=2, high=5).at((k + 0.5) / 400) for k in range(400)]
     assert [drawn.count(v) for v in (2, 3, 4, 5)] == [100] * 4
 
@@ -65,7 +65,7 @@ def test_every_whole_number_is_as_likely():
         ("radians(180)", math.pi),
     ],
 )
-def test_arithmetic_is_arithmetic(text, value):
+def test_arithmetic_expressions_are_evaluated(text, value):
     assert evaluate(text, {"gap": 3.0, "speed": 8.0}) == pytest.approx(value)
 
 
@@ -86,18 +86,18 @@ def test_arithmetic_is_arithmetic(text, value):
         "1 +",
     ],
 )
-def test_what_is_no_arithmetic_is_refused(text):
+def test_non_arithmetic_expressions_are_refused(text):
     with pytest.raises(ValueError, match=r"is (no|not)|exponent|allowed|characters"):
         evaluate(text, {"gap": 1.0})
 
 
-def test_what_has_no_finite_value_is_refused_with_the_numbers():
+def test_non_finite_results_are_refused_with_the_numbers():
     assert names_in("1 / (gap - 1)") == {"gap"}
     with pytest.raises(ValueError, match="gap = 1"):
         evaluate("1 / (gap - 1)", {"gap": 1.0})
 
 
-def test_derived_values_follow_those_they_need():
+def test_derived_values_are_computed_after_their_inputs():
     space = Space.model_validate(
         {
             "case": CASE,
@@ -142,7 +142,7 @@ def test_paths_lead_into_reset_and_operations():
         ("seed", "names 'seed'"),
     ],
 )
-def test_paths_that_lead_nowhere_are_refused(path, message):
+def test_invalid_paths_are_refused(path, message):
     parameter = {"kind": "float", "low": 1, "high": 2, "path": path}
     with pytest.raises((ValidationError, ValueError), match=message):
         Space.model_validate({"case": CASE, "parameters": {"x": parameter}})
@@ -173,7 +173,7 @@ def test_the_same_seed_gives_the_same_points(kind):
 
 
 @pytest.mark.parametrize("kind", ["sobol", "halton", "random"])
-def test_more_points_go_on_from_those_before(kind):
+def test_more_points_extend_the_earlier_ones(kind):
     few, many = (points_of(SpreadMethod(kind=kind, count=n), DRAWN)[0] for n in (6, 20))
     np.testing.assert_array_equal(many[:6], few)
 
@@ -184,7 +184,7 @@ def test_a_latin_hypercube_has_one_point_in_every_slice():
         assert sorted((column * 20).astype(int)) == list(range(20))
 
 
-def test_weights_of_importance_sampling_take_it_back():
+def test_importance_weights_undo_the_sampling_bias():
     """The probability of a corner is found from points drawn near it."""
     drawn = {"a": FloatRange(low=0, high=1), "b": FloatRange(low=0, high=1)}
     bumps = {"a": ImportanceBump(mean=0.98, std=0.05), "b": ImportanceBump(mean=0.98, std=0.05)}
@@ -224,13 +224,13 @@ def test_files_may_leave_plain_kinds_out(tmp_path):
         ("!!python/object/apply:os.system ['true']", "is not a valid sweep"),
     ],
 )
-def test_files_that_are_no_sweep_are_refused_with_a_reason(tmp_path, text, message):
+def test_invalid_sweep_files_are_refused_with_a_reason(tmp_path, text, message):
     path = tmp_path / "sweep.yaml"
     path.write_text(text)
     with pytest.raises(CommandError, match=message):
         load_sweep(path)
 
 
-def test_spaces_by_a_name_that_is_none_say_which_there_are():
+def test_an_unknown_space_is_refused_with_the_known_ones():
     with pytest.raises(CommandError, match="no space 'nothing'"):
         load_space("nothing")

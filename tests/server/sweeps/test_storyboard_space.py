@@ -53,7 +53,7 @@ def test_numbers_of_a_file_are_varied(folder, scene_folder):
     assert (reset["beyond_log"], reset["horizon"]) == ("extend", 150)
 
 
-def test_texts_that_are_put_in_when_a_file_is_read_are_varied_too(folder, scene_folder):
+def test_text_parameters_of_a_file_are_varied_too(folder, scene_folder):
     (folder / "space.yaml").write_text(
         SPACE + "  shape: {values: [linear, sinusoidal]}\n", encoding="utf-8"
     )
@@ -92,7 +92,7 @@ def test_distributions_of_a_file_are_parameters_of_its_space(folder, scene_folde
         (SPACE.replace("brakes.xosc", "{file: brakes.xosc, eggo: x}"), "eggo"),
     ],
 )
-def test_scenarios_that_are_no_space_are_refused_with_a_reason(folder, scene_folder, text, message):
+def test_invalid_scenario_spaces_are_refused_with_a_reason(folder, scene_folder, text, message):
     (folder / "space.yaml").write_text(text)
     with pytest.raises(CommandError, match=message):
         load_space(folder / "space.yaml", scene_folder)
@@ -103,7 +103,7 @@ def test_entities_of_a_storyboard_are_known_by_the_ids_of_their_objects():
     assert "Target_1" in adversaries_of({"storyboard": board})
 
 
-def test_a_found_failure_is_a_scenario_file_that_comes_out_the_same(folder, scene_folder, tmp_path):
+def test_a_found_failure_becomes_a_reproducible_scenario_file(folder, scene_folder, tmp_path):
     pytest.importorskip("cmaes")
     out = tmp_path / "out"
     (folder / "space.yaml").write_text(

@@ -59,7 +59,7 @@ def alone(sweep_file, scene_folder, tmp_path_factory) -> Path:
     return out
 
 
-def test_the_table_has_a_row_an_episode_in_order(alone):
+def test_the_table_has_one_row_per_episode_in_order(alone):
     rows = pq.read_table(alone / TABLE).to_pylist()
     assert [(r["point"], r["planner"]) for r in rows] == [
         (k, name) for k in range(4) for name in ("pid", "idm")
@@ -68,14 +68,14 @@ def test_the_table_has_a_row_an_episode_in_order(alone):
     assert all(0 <= r["score_nuplan_cls"] <= 1 for r in rows)
 
 
-def test_what_is_driven_already_is_not_driven_again(alone, sweep_file, scene_folder):
+def test_finished_episodes_are_not_driven_again(alone, sweep_file, scene_folder):
     before = (alone / TABLE).read_bytes()
     figures = run_sweep(load_sweep(sweep_file), alone, InProcess(), scenes=scene_folder)
     assert figures["driven now"] == 0
     assert (alone / TABLE).read_bytes() == before
 
 
-def test_the_worst_leave_recordings_that_replay_to_the_same_bits(alone, tiny_scene, scene_folder):
+def test_recordings_of_the_worst_episodes_replay_identically(alone, tiny_scene, scene_folder):
     from real2sim_server.scene.io import load_scene
 
     files = sorted((alone / RECORDINGS).iterdir())
@@ -130,7 +130,7 @@ def test_of_a_journal_that_is_cut_and_damaged_only_rows_that_were_written_are_le
     assert Journal(path).rows == found | {"new": {"x": 1.5}}
 
 
-def test_another_file_is_no_journal(tmp_path):
+def test_another_file_is_not_accepted_as_a_journal(tmp_path):
     path = tmp_path / "journal"
     path.write_text("something else\n")
     with pytest.raises(ValueError, match="not a journal"):
@@ -156,9 +156,7 @@ def test_a_stop_rule_ends_at_the_same_row_whatever_was_driven(alone, scene_folde
         ({"parameters": {"steps": {"low": 0, "high": 1}}}, "name of a column"),
     ],
 )
-def test_what_cannot_be_driven_is_refused_before_anything_is(
-    tmp_path, scene_folder, change, message
-):
+def test_invalid_sweeps_are_refused_before_driving(tmp_path, scene_folder, change, message):
     path = tmp_path / "sweep.yaml"
     path.write_text(yaml.safe_dump(SWEEP | change))
     with pytest.raises(CommandError, match=message):
@@ -166,7 +164,7 @@ def test_what_cannot_be_driven_is_refused_before_anything_is(
     assert not (tmp_path / "out").exists()
 
 
-def test_an_episode_that_cannot_begin_is_a_row_that_says_why(tmp_path, scene_folder):
+def test_an_episode_that_cannot_start_gets_a_row_with_the_reason(tmp_path, scene_folder):
     path = tmp_path / "sweep.yaml"
     start = {"path": "start_us", "low": 1e9, "high": 2e9}
     path.write_text(yaml.safe_dump(SWEEP | {"parameters": {"start": start}, "planners": ["pid"]}))
@@ -178,7 +176,7 @@ def test_an_episode_that_cannot_begin_is_a_row_that_says_why(tmp_path, scene_fol
 
 
 @pytest.mark.slow
-def test_two_processes_give_the_bytes_of_one(alone, sweep_file, scene_folder, tmp_path):
+def test_two_processes_give_the_same_bytes_as_one(alone, sweep_file, scene_folder, tmp_path):
     two = executor_of("processes", workers=2)
     run_sweep(load_sweep(sweep_file), tmp_path, two, scenes=scene_folder)
     assert (tmp_path / TABLE).read_bytes() == (alone / TABLE).read_bytes()
@@ -186,7 +184,7 @@ def test_two_processes_give_the_bytes_of_one(alone, sweep_file, scene_folder, tm
 
 @pytest.mark.ray
 @pytest.mark.slow
-def test_ray_gives_the_bytes_of_one_process(alone, sweep_file, scene_folder, tmp_path):
+def test_ray_gives_the_same_bytes_as_one_process(alone, sweep_file, scene_folder, tmp_path):
     pytest.importorskip("ray")
     run_sweep(load_sweep(sweep_file), tmp_path, executor_of("ray", workers=2), scenes=scene_folder)
     assert (tmp_path / TABLE).read_bytes() == (alone / TABLE).read_bytes()

@@ -1,4 +1,4 @@
-"""A street in which episodes run."""
+"""Fixtures: a straight street with cars, and worlds on it."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def _point_cloud() -> GaussianCloud:
 
 @pytest.fixture(scope="session")
 def make_scene() -> MakeScene:
-    """A scene of an ego path and cars by id; boxes 4 x 2 x 1.6 m."""
+    """A scene with an ego path and cars by id, each 4 x 2 x 1.6 m."""
 
     def make(ego: Trajectory | None = None, **cars: Trajectory) -> Scene:
         cloud = _point_cloud()
@@ -71,5 +71,5 @@ def make_world(make_scene: MakeScene) -> MakeWorld:
 
 @pytest.fixture(scope="session")
 def moving() -> Callable[..., Trajectory]:
-    """``moving(x, y, z=, speed=, yaw=)``: straight on, over the time of the scene."""
+    """``moving(x, y, z=, speed=, yaw=)``: a straight trajectory over the length of the scene."""
     return straight

@@ -1,4 +1,4 @@
-"""Drives worked out by hand along a straight street, and what they score."""
+"""Drives along a straight street, calculated by hand, and their scores."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ NOBODY = ObjectSamples((), (), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3)), 
 
 
 def context(steps: int, **changes) -> ScoringContext:
-    """A straight street along x; the recorded drive goes at 10 m/s."""
+    """A straight street along x; the recorded drive has 10 m/s."""
     made = ScoringContext(
         dt=DT,
         horizon=steps,
@@ -50,7 +50,7 @@ def car(x: float, y: float = 0.0, *, speed: float = 0.0, category: str = "car") 
 
 
 def drive(speeds: list[float], *, y: float = 0.0, others=None) -> list[Instant]:
-    """Instants of a drive along y; ``others`` gives everybody else by step."""
+    """Instants of a drive along x at lateral offset y; ``others(step)`` gives the other objects."""
     x, instants = 0.0, []
     for k, speed in enumerate(speeds):
         x += speed * DT if k else 0.0

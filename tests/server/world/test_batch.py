@@ -1,4 +1,4 @@
-"""Worlds in batches are single worlds: same motions, objects, contacts, ends."""
+"""Batched worlds match single worlds: motions, objects, contacts and episode ends."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def street() -> Scene:
 
 
 def compare(batch: BatchWorld, w: int, world: World, at_fault: int) -> None:
-    """Raise where a world of the batch is not the single one."""
+    """Assert that world ``w`` of the batch equals the single world."""
     assert np.array(world.motion.numbers) == pytest.approx(batch.motions[w], abs=CLOSE)
     assert world.T_world_vehicle == pytest.approx(batch.poses[w], abs=CLOSE)
     assert world.T_world_body == pytest.approx(batch.body_pose(w), abs=CLOSE)
@@ -53,7 +53,7 @@ def compare(batch: BatchWorld, w: int, world: World, at_fault: int) -> None:
 def drive_beside(
     scene: Scene, fields: dict[str, Any], worlds: int, steps: int, plan_us: Any = PLAN_US
 ) -> BatchWorld:
-    """A batch, step by step beside as many single worlds with the same actions."""
+    """A batch, compared after each step with single worlds that take the same actions."""
     spec, state = ResetSpec(**fields), ScenarioState.of(scene)
     batch = BatchWorld(scene, spec, worlds, state=state)
     single = [World(scene, state, spec) for _ in range(worlds)]
@@ -95,11 +95,11 @@ def drive_beside(
         {"action": "trajectory", "ego": {"tracker": "pursuit", "dynamics": "dynamic_bicycle"}},
     ],
 )
-def test_worlds_of_a_batch_are_single_worlds(street: Scene, fields: dict[str, Any]) -> None:
+def test_batched_worlds_match_single_worlds(street: Scene, fields: dict[str, Any]) -> None:
     drive_beside(street, fields, worlds=5, steps=30)
 
 
-def test_plans_of_a_single_pose_go_on_from_one_another_as_in_single_worlds(street: Scene) -> None:
+def test_successive_single_pose_plans_match_single_worlds(street: Scene) -> None:
     fields = {"action": "trajectory", "ego": {"tracker": "lqr"}}
     drive_beside(street, fields, worlds=3, steps=15, plan_us=np.array([200_000]))
 
@@ -110,7 +110,7 @@ def test_contacts_end_episodes_as_in_single_worlds(street: Scene) -> None:
     assert batch.off_road.any()
 
 
-def test_objects_come_and_go_as_in_single_worlds(
+def test_objects_appear_and_disappear_as_in_single_worlds(
     make_scene: Callable[..., Scene], moving: Callable[..., Any]
 ) -> None:
     def during(trajectory: Any, first: int, last: int) -> Any:
@@ -128,7 +128,7 @@ def test_objects_come_and_go_as_in_single_worlds(
         drive_beside(scene, fields, worlds=3, steps=40)
 
 
-def test_a_reset_begins_some_episodes_anew(street: Scene) -> None:
+def test_reset_restarts_only_the_selected_worlds(street: Scene) -> None:
     spec = ResetSpec(action="control", horizon=3)
     batch = BatchWorld(street, spec, 4)
     first = batch.motions.copy()
@@ -146,7 +146,7 @@ def test_a_reset_begins_some_episodes_anew(street: Scene) -> None:
     compare(batch, 3, world, 0)
 
 
-def test_worlds_that_are_over_stand_still(street: Scene) -> None:
+def test_finished_worlds_do_not_move(street: Scene) -> None:
     batch = BatchWorld(street, ResetSpec(action="control", horizon=1), 2)
     batch.step(np.zeros((2, 2)))
     before = batch.motions.copy(), batch.times_us.copy()
@@ -156,7 +156,7 @@ def test_worlds_that_are_over_stand_still(street: Scene) -> None:
     assert done.progress.tolist() == [0.0, 0.0]
 
 
-def test_bits_do_not_depend_on_the_number_of_threads(street: Scene) -> None:
+def test_results_do_not_depend_on_the_number_of_threads(street: Scene) -> None:
     threads, found = numba.get_num_threads(), []
     try:
         for count in (1, threads):
@@ -186,9 +186,7 @@ def test_bits_do_not_depend_on_the_number_of_threads(street: Scene) -> None:
         ({"beyond_log": "extend"}, "beyond_log"),
     ],
 )
-def test_what_batches_do_not_know_is_refused(
-    street: Scene, fields: dict[str, Any], named: str
-) -> None:
+def test_unsupported_options_are_refused(street: Scene, fields: dict[str, Any], named: str) -> None:
     with pytest.raises(WorldError, match=named):
         BatchWorld(street, ResetSpec(**fields), 2)
 
@@ -202,7 +200,7 @@ def test_what_batches_do_not_know_is_refused(
         ("trajectory", np.zeros((2, 2, 3)), None),
     ],
 )
-def test_bad_actions_are_refused(
+def test_malformed_actions_are_refused(
     street: Scene, action: str, actions: np.ndarray, plan_us: list[int] | None
 ) -> None:
     batch = BatchWorld(street, ResetSpec(action=action), 2)
@@ -210,7 +208,7 @@ def test_bad_actions_are_refused(
         batch.step(actions, plan_us=plan_us)
 
 
-def test_what_worlds_show_stands_in_arrays_as_in_instances(street: Scene) -> None:
+def test_shown_arrays_match_the_instances(street: Scene) -> None:
     batch = BatchWorld(street, ResetSpec(action="control"), 2)
     batch.reset([1], start_us=[street.start_us + 3_000_000])
     shown = batch.shown([0, 1])
@@ -225,7 +223,7 @@ def test_what_worlds_show_stands_in_arrays_as_in_instances(street: Scene) -> Non
             assert shown.times_us[w] == instance.t_us
 
 
-def test_edited_worlds_are_shown_one_by_one(street: Scene) -> None:
+def test_edited_worlds_have_no_shared_arrays(street: Scene) -> None:
     region = EraseRegion(pose=Pose(position=(0, 0, 0)), size=(1, 1, 1))
     state = apply_operations(ScenarioState.of(street), [region]).state
     assert BatchWorld(street, ResetSpec(action="control"), 2, state=state).shown([0]) is None

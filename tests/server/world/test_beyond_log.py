@@ -1,4 +1,4 @@
-"""Episodes that outlast the recording: loops, routes that go on, road users that come and go."""
+"""Episodes longer than the recording: loops, extended routes and spawned road users."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ CONTROL = {"action": "control", "privileged": True}
 LOOP = {"beyond_log": "loop", "horizon": 300}
 SPAWN = {"density": 40, "lanes": [{"offset": 0.0}, {"offset": 3.5, "oncoming": True}]}
 LENGTH = 120.0
-"""Of the recorded drive: 12 s at 10 m/s."""
+"""Length of the recorded drive [m]: 12 s at 10 m/s."""
 
 
 def bend(radius: float = 120.0, speed: float = 10.0) -> Trajectory:
-    """A left bend, driven at a constant speed."""
+    """A left bend at constant speed."""
     times = 5_000_000 + np.arange(121) * 100_000
     angle = (times - times[0]) * 1e-6 * speed / radius
     positions = np.stack(
@@ -38,7 +38,7 @@ def bend(radius: float = 120.0, speed: float = 10.0) -> Trajectory:
 
 
 def following(world: World, *, speed: float = 10.0) -> TrajectoryPlan:
-    """Along the route of the observation."""
+    """A plan along the route of the observation."""
     route = np.vstack([[0.0, 0.0], world.observe().route])
     ways = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(route, axis=0), axis=1))])
     at = speed * 0.25 * np.arange(1, 9)
@@ -63,7 +63,7 @@ def test_a_horizon_beyond_the_log_is_refused_by_default(make_world):
 
 
 @pytest.mark.parametrize("beyond_log", ["loop", "extend"])
-def test_without_a_horizon_an_episode_goes_on_for_an_hour(make_world, beyond_log):
+def test_without_a_horizon_an_episode_lasts_an_hour(make_world, beyond_log):
     world = make_world(spec=CONTROL | {"beyond_log": beyond_log})
     assert world.horizon == 36_000
     for _ in range(130):
@@ -79,7 +79,7 @@ def test_stored_episodes_without_a_horizon_end_with_the_log():
     assert ResetSpec().horizon is None
 
 
-def test_within_the_log_a_loop_is_the_same_drive(make_world, moving):
+def test_a_loop_matches_the_log_before_its_end(make_world, moving):
     car = moving(40, 0, z=0.8, speed=6.0)
     as_today = make_world(car=car, spec=CONTROL | {"horizon": 60})
     looping = make_world(car=car, spec=CONTROL | {"horizon": 60, "beyond_log": "loop"})
@@ -92,7 +92,7 @@ def test_within_the_log_a_loop_is_the_same_drive(make_world, moving):
 # --- extend ---------------------------------------------------------------------------------------
 
 
-def test_an_extended_route_goes_on_with_its_bend_which_fades(make_world):
+def test_an_extended_route_continues_its_bend_and_straightens(make_world):
     world = make_world(bend(), spec=CONTROL | {"beyond_log": "extend", "horizon": 400})
     path, end = world._path, LoggedPath(bend()).length
     yaws = [path.at(end + way)[3] for way in (0.0, 20.0, 40.0, 150.0, 300.0)]
@@ -120,7 +120,7 @@ def test_an_extended_episode_is_driven_to_its_horizon_and_scored(make_world):
 
 @pytest.fixture(scope="module")
 def laps(make_world):
-    """A drive of 30 s in a loop of 12 s: its worlds' events, motions and last world."""
+    """A 30 s drive on a 12 s loop: the final world, all events and all motions."""
     world = make_world(bend(), spec=LOOP | {"privileged": True, "ego": {"tracker": "lqr"}})
     events, motions = [], [world.motion]
     while not world.over:
@@ -129,7 +129,7 @@ def laps(make_world):
     return world, events, motions
 
 
-def test_the_ego_is_put_back_and_told(laps):
+def test_the_ego_returns_to_the_start_with_an_event_for_each_lap(laps):
     world, events, _ = laps
     looped = [e for e in events if e.type == "looped"]
     assert [e.data["lap"] for e in looped] == [1.0, 2.0]
@@ -137,7 +137,7 @@ def test_the_ego_is_put_back_and_told(laps):
     assert world.observe().obs_fields()["lap"] == 2
 
 
-def test_the_event_tells_where_places_before_it_are_now(laps):
+def test_the_looped_event_holds_the_transform_across_the_seam(laps):
     _, events, motions = laps
     seam = next(e for e in events if e.type == "looped")
     k = (seam.t_us - 5_000_000) // 100_000
@@ -148,7 +148,7 @@ def test_the_event_tells_where_places_before_it_are_now(laps):
     assert math.dist(here, (after.x, after.y)) == pytest.approx(before.speed * 0.1, abs=0.1)
 
 
-def test_scores_know_nothing_of_the_seam(laps):
+def test_scores_are_continuous_across_the_seam(laps):
     world, _, _ = laps
     metrics = world.metrics()
     assert metrics["distance"] == pytest.approx(300.0, abs=5.0)
@@ -161,7 +161,7 @@ def test_scores_know_nothing_of_the_seam(laps):
 
 
 @pytest.mark.parametrize("action", ["trajectory", "pose"])
-def test_a_plan_in_the_world_is_carried_over_the_seam(make_world, action):
+def test_world_frame_plans_are_transformed_across_the_seam(make_world, action):
     world = make_world(bend(), spec=LOOP | {"action": action, "horizon": 200})
     while world.steps < 119:
         ahead = world._path.at(world._path_point.s + 1.0)
@@ -184,7 +184,7 @@ def test_a_plan_in_the_world_is_carried_over_the_seam(make_world, action):
     assert abs(world.observe().metrics["lateral_offset"]) < 0.3
 
 
-def test_what_stands_goes_on_standing_and_what_moved_leaves(make_world, moving):
+def test_parked_cars_stay_and_moving_cars_leave_after_a_lap(make_world, moving):
     cars = {"parked": moving(50, 6, z=0.8), "mover": moving(40, 0, z=0.8, speed=12.0)}
     world = make_world(spec=CONTROL | LOOP, **cars)
     while world.steps < 150:
@@ -193,7 +193,7 @@ def test_what_stands_goes_on_standing_and_what_moved_leaves(make_world, moving):
     assert [o.object_id for o in world.agents.objects] == ["parked"]
 
 
-def test_two_tracks_of_one_parked_car_do_not_stand_in_one_place(make_scene, moving):
+def test_duplicate_tracks_of_a_parked_car_are_merged(make_scene, moving):
     whole = moving(50, 6, z=0.8)
     first = Trajectory(whole.times_us[:60], whole.positions[:60], whole.quaternions[:60])
     shifted = whole.positions[70:] + np.array([0.4, 0.1, 0.0])
@@ -214,7 +214,7 @@ def test_an_edit_in_a_later_lap_takes_effect(make_world, moving):
     assert world.agents.positions[0, 1] == pytest.approx(8.0)
 
 
-def test_drivers_go_on_after_an_edit_whatever_other_episodes_run(make_scene, moving):
+def test_drivers_keep_their_plans_after_an_edit_despite_other_episodes(make_scene, moving):
     scene = make_scene(driven=moving(50, 6, z=0.8), other=moving(70, 6, z=0.8))
     state = ScenarioState.of(scene)
     agents = {"drivers": {"driven": {"kind": "external"}}}
@@ -231,17 +231,17 @@ def test_drivers_go_on_after_an_edit_whatever_other_episodes_run(make_scene, mov
     assert places["driven"][0] == pytest.approx(60.0)
 
 
-def test_a_recorded_drive_of_a_few_metres_is_no_loop(make_world, moving):
+def test_a_drive_too_short_to_loop_is_refused(make_world, moving):
     with pytest.raises(WorldError, match="too short to be driven in a loop"):
         make_world(moving(speed=1.0), spec=LOOP)
 
 
-# --- road users that come and go ------------------------------------------------------------------
+# --- spawned road users ---------------------------------------------------------------------------
 
 
 @pytest.fixture
 def street(make_world, moving):
-    """A loop in which cars come and go."""
+    """Make a looped episode with spawned cars."""
 
     def make(seed: int = 0, *, spec: dict | None = None, **spawn):
         agents = {"spawn": SPAWN | spawn}
@@ -252,7 +252,7 @@ def street(make_world, moving):
     return make
 
 
-def test_cars_come_and_go_and_touch_nobody(street):
+def test_spawned_cars_appear_and_disappear_without_contact(street):
     world, seen, most = street(), set(), 0
     while not world.over:
         world.step(following(world, speed=8.0))
@@ -265,7 +265,7 @@ def test_cars_come_and_go_and_touch_nobody(street):
     assert len(spawned(world)) < len(seen)
 
 
-def test_nobody_appears_near_anybody_or_far_from_the_stretch(street):
+def test_cars_spawn_10_to_80_metres_from_the_ego(street):
     world, before = street(), set()
     for _ in range(150):
         now = set(spawned(world))
@@ -279,7 +279,7 @@ def test_nobody_appears_near_anybody_or_far_from_the_stretch(street):
         world.step(following(world))
 
 
-def test_oncoming_cars_head_the_other_way_on_their_lane(street):
+def test_oncoming_cars_drive_against_the_ego_in_their_lane(street):
     world = street(lanes=[{"offset": 3.5, "oncoming": True}], density=60)
     for _ in range(60):
         world.step(following(world))
@@ -289,7 +289,7 @@ def test_oncoming_cars_head_the_other_way_on_their_lane(street):
                 assert world.agents.positions[k, 1] == pytest.approx(3.5, abs=0.2)
 
 
-def test_spawned_cars_have_ids_and_instances_of_their_own(street):
+def test_spawned_cars_have_unique_ids_and_instances(street):
     world = street(density=100)
     for _ in range(100):
         world.step(following(world))
@@ -298,14 +298,14 @@ def test_spawned_cars_have_ids_and_instances_of_their_own(street):
         assert len({o.instance_id for o in objects}) == len(objects)
 
 
-def test_there_are_never_more_than_asked_for(street):
+def test_the_number_of_spawned_cars_is_limited(street):
     world = street(density=200, most=3)
     for _ in range(60):
         world.step(following(world))
         assert len(spawned(world)) <= 3
 
 
-def test_seeds_spawn_differently_and_the_same_seed_does_not(street):
+def test_spawning_depends_only_on_the_seed(street):
     def drive(seed: int) -> list[str]:
         world, found = street(seed), []
         for _ in range(80):
@@ -317,7 +317,7 @@ def test_seeds_spawn_differently_and_the_same_seed_does_not(street):
     assert drive(1) != drive(2)
 
 
-def test_an_edit_leaves_spawned_cars_alone(street):
+def test_an_edit_keeps_spawned_cars(street):
     world = street()
     for _ in range(30):
         world.step(following(world))
@@ -326,15 +326,15 @@ def test_an_edit_leaves_spawned_cars_alone(street):
     assert spawned(world) == before != []
 
 
-def test_edits_that_name_a_drawn_road_user_say_what_they_may_name():
+def test_editing_a_randomly_spawned_road_user_is_refused():
     with pytest.raises(ValueError, match=r"'spawned:1' was created by agents.spawn .* 'spawned_1'"):
         Translate(object_id="spawned:1", y=-1.0)
     with pytest.raises(ValueError, match="cannot be edited"):
         OPERATION.validate_python({"op": "delete", "object_id": "spawned:1"})
 
 
-def test_a_struck_spawned_car_is_moved_by_physics(street):
-    # Nobody could stop for an ego that goes straight at them at 20 m/s.
+def test_spawned_cars_can_be_struck(street):
+    # No driver can avoid an ego that approaches at 20 m/s.
     world = street(
         spec={"on_collision": "continue", "action": "control"}, lanes=[{"offset": 0.0}], density=60
     )
@@ -345,18 +345,18 @@ def test_a_struck_spawned_car_is_moved_by_physics(street):
     assert hit.startswith("spawned:")
 
 
-def test_a_look_that_does_not_exist_is_refused(street):
+def test_an_unknown_look_is_refused(street):
     with pytest.raises(WorldError, match="'ghost', which is not an object") as refused:
         street(looks=["ghost"])
     assert refused.value.code == ErrorCode.UNKNOWN_OBJECT
 
 
-def test_a_scene_without_vehicles_has_nobody_to_look_like(make_world):
+def test_spawning_needs_a_vehicle_in_the_scene(make_world):
     with pytest.raises(WorldError, match="has no appearance"):
         make_world(spec={"agents": {"spawn": SPAWN}})
 
 
-def test_cars_also_come_and_go_where_the_episode_ends_with_the_log(street):
+def test_cars_also_spawn_in_episodes_that_end_with_the_log(street):
     world = street(spec={"beyond_log": "end", "horizon": 100})
     while not world.over:
         world.step(following(world))
@@ -367,7 +367,7 @@ def test_cars_also_come_and_go_where_the_episode_ends_with_the_log(street):
 # --- replay ---------------------------------------------------------------------------------------
 
 
-def test_a_recording_of_laps_and_traffic_replays_and_scores_the_same(make_scene, moving):
+def test_recorded_laps_with_traffic_replay_with_the_same_scores(make_scene, moving):
     scene = make_scene(bend(), look=moving(30, 8, z=0.8, speed=8.0))
     beside = {"density": 40, "lanes": [{"offset": 3.5, "oncoming": True}]}
     spec = ResetSpec(**LOOP, privileged=True, seed=3, agents={"spawn": beside})

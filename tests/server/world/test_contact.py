@@ -24,7 +24,7 @@ def collisions(world, steps: int) -> list[tuple[int, str, float]]:
     return found
 
 
-def test_the_ego_box_stands_on_the_ground_with_the_axle_near_its_rear():
+def test_the_ego_box_rests_on_the_ground_around_the_rear_axle():
     T = np.eye(4)
     T[:3, 3] = [10, 0, 1]
     box = ego_box(T, (4.6, 1.85, 1.6))
@@ -33,8 +33,8 @@ def test_the_ego_box_stands_on_the_ground_with_the_axle_near_its_rear():
     assert box[2, 3] - 0.8 == pytest.approx(1)
 
 
-def test_a_contact_is_reported_when_the_bumper_gets_there(make_world, moving):
-    # The front bumper is 3.65 m ahead of the rear axle, the car's rear end at x = 18.
+def test_contact_is_reported_when_the_bumper_reaches_the_car(make_world, moving):
+    # The front bumper is 3.65 m ahead of the rear axle. The car's rear end is at x = 18.
     world = make_world(car=moving(20, 0, z=0.8), spec=GO_ON)
 
     assert collisions(world, 20) == [(15, "car", pytest.approx(10.0))]
@@ -42,14 +42,14 @@ def test_a_contact_is_reported_when_the_bumper_gets_there(make_world, moving):
     assert not world.over
 
 
-def test_relative_speed_counts_both_motions(make_world, moving):
+def test_relative_speed_includes_both_motions(make_world, moving):
     world = make_world(car=moving(40, 0, z=0.8, speed=5.0, yaw=np.pi), spec=GO_ON)
     (_, object_id, relative_speed), *_ = collisions(world, 40)
 
     assert (object_id, relative_speed) == ("car", pytest.approx(15.0))
 
 
-def test_a_contact_ends_the_episode_where_asked(make_world, moving):
+def test_contact_ends_the_episode_by_default(make_world, moving):
     world = make_world(car=moving(20, 0, z=0.8), spec={"action": "control"})
     while not world.over:
         world.step(COAST)
@@ -58,20 +58,20 @@ def test_a_contact_ends_the_episode_where_asked(make_world, moving):
     assert (world.terminated, world.truncated, world.reason) == (True, False, "collision")
 
 
-def test_passing_closely_is_no_contact(make_world, moving):
+def test_a_close_pass_is_not_a_contact(make_world, moving):
     # Half widths: 0.925 m of the ego, 1 m of the car.
     world = make_world(car=moving(20, 1.93, z=0.8), spec=GO_ON)
 
     assert collisions(world, 60) == []
 
 
-def test_a_bridge_overhead_is_no_contact(make_world, moving):
+def test_driving_under_a_bridge_is_not_a_contact(make_world, moving):
     world = make_world(bridge=moving(20, 0, z=6.0), spec=GO_ON)
 
     assert collisions(world, 60) == []
 
 
-def test_an_object_that_overlaps_at_the_start_is_ignored_until_it_separates(make_world, moving):
+def test_an_initial_overlap_is_ignored_until_the_objects_separate(make_world, moving):
     beginning = make_world(car=moving(3, 1.5, z=0.8, speed=10.0), spec=GO_ON)
     assert collisions(beginning, 20) == []
 
@@ -93,7 +93,7 @@ def test_a_second_contact_with_the_same_object_is_reported_again(make_world, mov
     assert world.metrics()["collisions"] == 2
 
 
-def test_two_objects_hit_at_once_are_two_contacts(make_world, moving):
+def test_hitting_two_objects_at_once_reports_two_contacts(make_world, moving):
     world = make_world(
         a=moving(20, 1.2, z=0.8), b=moving(20, -1.2, z=0.8), c=moving(20, 9), spec=GO_ON
     )
@@ -101,14 +101,14 @@ def test_two_objects_hit_at_once_are_two_contacts(make_world, moving):
     assert [(step, i) for step, i, _ in collisions(world, 15)] == [(15, "a"), (15, "b")]
 
 
-def test_an_object_put_onto_the_ego_is_a_collision_of_the_next_step(make_world, moving):
+def test_an_object_moved_into_the_ego_collides_at_the_next_step(make_world, moving):
     world = make_world(car=moving(50, 20, z=0.8), spec=GO_ON)
     world.apply([SetPose(object_id="car", pose=Pose(position=(2.0, 0.0, 0.8)))])
 
     assert [e.type for e in world.step(COAST)] == ["edited", "collision"]
 
 
-def test_an_object_moved_out_of_the_way_is_not_hit(make_world, moving):
+def test_an_object_moved_off_the_route_is_not_hit(make_world, moving):
     world = make_world(car=moving(20, 0, z=0.8), spec=GO_ON)
     world.apply([Translate(object_id="car", y=4)])
 

@@ -1,4 +1,4 @@
-"""Deformation after impacts: what is drawn of an object, always alike."""
+"""Deformation after impacts: drawn clouds and their reproducibility."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ GO_ON = {"action": "control", "on_collision": "continue", "contact": {"masses": 
 
 @pytest.fixture(scope="module", autouse=True)
 def coarse_matter():
-    """Every crash of these tests in a fraction of the usual time."""
+    """Use few particles so that crashes run fast."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(crash, "PARTICLES", 500)
         yield
 
 
 def shell(size: tuple[float, float, float] = SIZE) -> GaussianCloud:
-    """Gaussians all over the surface of a box."""
+    """Gaussians on the surface of a box."""
     axes = [torch.linspace(-s / 2, s / 2, round(s / 0.1) + 1) for s in size]
     grid = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).reshape(-1, 3)
     means = grid[((grid.abs() - torch.tensor(size) / 2).abs() < 1e-4).any(dim=1)]
@@ -49,7 +49,7 @@ def shell(size: tuple[float, float, float] = SIZE) -> GaussianCloud:
 
 @pytest.fixture
 def crash_scene(make_scene, moving):
-    """``crash_scene(car=trajectory, ...)``: objects with bodywork to be dented."""
+    """``crash_scene(car=trajectory, ...)``: a scene whose objects have a body shell."""
 
     def make(category: str = "car", *, speed: float = 10.0, **paths):
         scene = make_scene(moving(speed=speed), **paths)
@@ -83,7 +83,7 @@ def bits(cloud: GaussianCloud) -> str:
 # --- in the world -----------------------------------------------------------------------------
 
 
-def test_an_impacted_car_is_drawn_deformed_where_it_was_hit(crash_scene, moving):
+def test_a_struck_car_is_deformed_at_the_impact(crash_scene, moving):
     scene = crash_scene(car=moving(20, 0, z=0.75), other=moving(20, 5, z=0.75))
     world = world_of(scene)
     drive_until_contact(world)
@@ -98,7 +98,7 @@ def test_an_impacted_car_is_drawn_deformed_where_it_was_hit(crash_scene, moving)
     assert torch.equal(cloud_of(world, "other").means, before)
 
 
-def test_a_dent_grows_for_a_tenth_of_a_second_and_then_stays(crash_scene, moving):
+def test_a_dent_grows_during_the_impact_and_then_stays(crash_scene, moving):
     world = world_of(crash_scene(car=moving(20, 0, z=0.75)), dt_us=20_000, horizon=400)
     while not world.impacts:
         world.step(COAST)
@@ -111,12 +111,12 @@ def test_a_dent_grows_for_a_tenth_of_a_second_and_then_stays(crash_scene, moving
         depths.append(float(shift[rear].max()))
     assert 0 < depths[0] < 0.7 * depths[-1]
     still = torch.stack([(d == drawn[-1]).all(dim=1) for d in drawn[-5:]]).all(dim=0)
-    # The bumper at the rear hangs by one end, and goes on to sink for a second.
+    # The rear bumper hangs by one end and sinks for another second.
     assert still[world.scene.objects["car"].cloud.means[:, 0] > -1.6].all()
     assert still.double().mean() > 0.9
 
 
-def test_a_loose_bumper_and_fragments_come_to_rest_and_then_stay(crash_scene, moving):
+def test_loose_parts_and_fragments_come_to_rest(crash_scene, moving):
     world = world_of(crash_scene(speed=15.0, car=moving(20, 0, z=0.75)), dt_us=20_000, horizon=400)
     while not world.impacts:
         world.step(COAST)
@@ -132,7 +132,7 @@ def test_a_loose_bumper_and_fragments_come_to_rest_and_then_stay(crash_scene, mo
     assert kept[150] == kept[155]
 
 
-def test_what_is_drawn_does_not_depend_on_what_was_drawn_before(crash_scene, moving):
+def test_a_frame_does_not_depend_on_earlier_frames(crash_scene, moving):
     world = world_of(crash_scene(car=moving(20, 0.4, z=0.75)), dt_us=20_000, horizon=400)
     while not world.impacts:
         world.step(COAST)
@@ -149,7 +149,7 @@ def test_what_is_drawn_does_not_depend_on_what_was_drawn_before(crash_scene, mov
     assert len(set(drawn)) > 3
 
 
-def test_an_image_solves_no_more_of_a_crash_than_it_shows(crash_scene, moving, monkeypatch):
+def test_a_frame_solves_the_crash_only_up_to_its_time(crash_scene, moving, monkeypatch):
     world = world_of(crash_scene(car=moving(20, 0, z=0.75)), dt_us=20_000, horizon=400)
     while not world.impacts:
         world.step(COAST)
@@ -162,13 +162,13 @@ def test_an_image_solves_no_more_of_a_crash_than_it_shows(crash_scene, moving, m
         before = len(solved)
         world.deformation.solve(world.t_us)
         spans.append(sum(solved[before:]))
-    # Of each 20 ms what they hold, and what fills its last frame; nothing once it is over.
+    # Each image solves its 20 ms up to the next full frame, and nothing after the crash.
     assert sum(spans) > 0.1
     assert max(spans) < 0.05
     assert spans[-3:] == [0, 0, 0]
 
 
-def test_what_the_crash_does_not_reach_stays_as_it_was(crash_scene, moving):
+def test_gaussians_away_from_the_crash_are_unchanged(crash_scene, moving):
     world = world_of(crash_scene(car=moving(20, 0, z=0.75)))
     drive_until_contact(world)
     for _ in range(5):
@@ -179,7 +179,7 @@ def test_what_the_crash_does_not_reach_stays_as_it_was(crash_scene, moving):
     assert torch.equal(after.quats[same], before.quats[same])
 
 
-def test_the_same_crash_leaves_the_same_dent_in_a_replay_and_in_a_fork(crash_scene, moving):
+def test_replays_and_forks_reproduce_the_dent(crash_scene, moving):
     scene, spec = crash_scene(car=moving(20, 0.4, z=0.75)), ResetSpec(**GO_ON)
     entries = [Entry("reset", 0, reset_payload(spec))]
     entries += [Entry("action", k, action_payload(COAST)) for k in range(25)]
@@ -198,7 +198,7 @@ def test_the_same_crash_leaves_the_same_dent_in_a_replay_and_in_a_fork(crash_sce
     assert bits(cloud_of(world)) != bits(scene.objects["car"].cloud)
 
 
-def test_what_broke_lies_on_the_road_unless_the_episode_is_from_before(crash_scene, moving):
+def test_breakage_adds_fragments_above_the_ground(crash_scene, moving):
     scene = crash_scene(car=moving(20, 0, z=0.75))
     drawn = {}
     for breakage in (True, False):
@@ -225,7 +225,7 @@ def test_what_broke_lies_on_the_road_unless_the_episode_is_from_before(crash_sce
         ("car", 1.0, {}),
     ],
 )
-def test_what_is_switched_off_alive_or_hit_slowly_is_not_deformed(
+def test_disabled_dents_pedestrians_and_slow_impacts_do_not_deform(
     crash_scene, moving, category, speed, spec
 ):
     scene = crash_scene(category, speed=speed, car=moving(5.5 + 1.5 * speed, 0, z=0.75))
@@ -235,7 +235,7 @@ def test_what_is_switched_off_alive_or_hit_slowly_is_not_deformed(
     assert torch.equal(cloud_of(world).means, scene.objects["car"].cloud.means)
 
 
-def test_a_car_pushed_into_the_next_is_dented_at_both_ends(crash_scene, moving):
+def test_a_car_pushed_into_another_is_dented_at_both_ends(crash_scene, moving):
     scene = crash_scene(car=moving(20, 0, z=0.75), next=moving(24.8, 0, z=0.75))
     world = world_of(scene)
     for _ in range(40):
@@ -257,7 +257,7 @@ def crasher(x: float, y: float, vx: float, *, yaw: float = 0.0, mass: float = MA
 
 
 @pytest.mark.parametrize(("mass", "y"), [(1500.0, 0.0), (3000.0, 0.0), (1500.0, 0.7)])
-def test_momentum_of_both_stays_and_delta_v_is_that_of_the_rigid_exchange(mass, y):
+def test_momentum_is_conserved_and_delta_v_matches_a_rigid_impact(mass, y):
     first, second = crasher(-4.15, y, 10.0), crasher(0.0, 0.0, 0.0, mass=mass)
     front, hit = crash.simulate_impact(first, second)
     total = MASS * front.delta_v + mass * hit.delta_v
@@ -267,12 +267,12 @@ def test_momentum_of_both_stays_and_delta_v_is_that_of_the_rigid_exchange(mass, 
         assert -front.delta_v[0] == pytest.approx(rigid, rel=0.12)
 
 
-def test_both_dents_together_are_as_deep_as_the_mutual_stiffness_says():
+def test_total_dent_depth_matches_the_mutual_stiffness():
     first, second = crasher(-4.15, 0.0, 10.0), crasher(0.0, 0.0, 0.0)
     depth = sum(dent.depth for dent in crash.simulate_impact(first, second))
     energy = 0.25 * MASS * 10.0**2
     assert depth == pytest.approx((2 * energy / 405e3) ** 0.5, rel=0.35)
 
 
-def test_bodies_that_pass_each_other_are_not_deformed():
+def test_passing_bodies_are_not_deformed():
     assert crash.simulate_impact(crasher(-4.0, 2.5, 10.0), crasher(0.0, 0.0, 0.0)) is None

@@ -1,4 +1,4 @@
-"""The contract of drivers of other road users, for all members and for one that is made here."""
+"""The contract of drivers of other road users, for all built-in drivers and a custom one."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from real2sim_server.world.traffic.driver import recorded_pose
 
 
 class CoastDriver(Model):
-    """Rolls out from its recorded speed."""
+    """Coasts from the recorded speed."""
 
     kind: Literal["coast"] = "coast"
     resistance: float = 0.015
@@ -28,7 +28,7 @@ class CoastDriver(Model):
 
 @dataclass(frozen=True, eq=False)
 class Coast:
-    """Goes straight on and is slowed down by rolling resistance until it stands."""
+    """Drives straight and decelerates by rolling resistance to a stop."""
 
     subject: ObjectState
     spec: CoastDriver
@@ -53,7 +53,7 @@ SPECS = {spec.model_fields["kind"].default: spec for spec in (*DRIVERS, CoastDri
 
 @pytest.fixture(params=SPECS)
 def world(request, monkeypatch, make_world, moving):
-    """A world in which one car has the driver."""
+    """A world in which the parametrized driver controls one car."""
     monkeypatch.setitem(DRIVERS, CoastDriver, Coast.begin)
     agents = AgentsSpec.model_construct(drivers={"car": SPECS[request.param]()})
     spec = ResetSpec().model_copy(update={"agents": agents})
@@ -67,7 +67,7 @@ def driver_of(world) -> AgentDriver:
     return world.traffic.drivers["car"]
 
 
-def test_a_driver_begins_when_its_object_appears(world):
+def test_a_driver_starts_with_its_object(world):
     driver = driver_of(world)
 
     assert driver.subject.object_id == "car"
@@ -84,7 +84,7 @@ def test_poses_are_finite_with_unit_quaternions(world):
         assert math.hypot(*pose.quaternion) == pytest.approx(1.0)
 
 
-def test_a_step_makes_a_new_driver_and_leaves_the_old_one(world):
+def test_a_step_returns_a_new_driver(world):
     before = driver_of(world)
     pose = before.pose
     world.step()
@@ -93,7 +93,7 @@ def test_a_step_makes_a_new_driver_and_leaves_the_old_one(world):
     assert before.pose == pose
 
 
-def test_same_surroundings_lead_to_the_same_pose(world):
+def test_equal_surroundings_give_equal_poses(world):
     fork = world.fork()
     for _ in range(5):
         world.step()
@@ -102,7 +102,7 @@ def test_same_surroundings_lead_to_the_same_pose(world):
     assert driver_of(world).pose == driver_of(fork).pose
 
 
-def test_an_object_covers_what_its_velocity_says(world):
+def test_displacement_is_limited_by_velocity(world):
     for _ in range(5):
         before = driver_of(world).pose
         world.step()
@@ -112,7 +112,7 @@ def test_an_object_covers_what_its_velocity_says(world):
         assert covered <= (fastest + 0.5) * 0.1 + 1e-6
 
 
-def test_the_drivers_of_the_wire_are_the_members_of_the_family():
+def test_protocol_drivers_match_the_registry():
     union, _ = get_args(AgentDriverUnion)
 
     assert set(get_args(union)) == set(DRIVERS)

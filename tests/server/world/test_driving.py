@@ -1,4 +1,4 @@
-"""Kernels of the vehicle against other ways to the same figures."""
+"""Vehicle kernels against independent implementations."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ SECOND = 1_000_000
 NOTHING = np.empty((0, 2))
 seeds = st.integers(0, 10_000)
 compiling = settings(deadline=None)
-"""The first example waits for the compiler."""
+"""No deadline: the first example compiles the kernel."""
 
 
 def state_of(*, speed: float, x: float = 0.0, y: float = 0.0, yaw: float = 0.0) -> PlanarState:
@@ -61,7 +61,7 @@ def state_of(*, speed: float, x: float = 0.0, y: float = 0.0, yaw: float = 0.0) 
 
 
 def some_plan(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Times [us] and poses of a winding way at about 8 m/s, from near the origin."""
+    """Times [us] and poses of a winding path at about 8 m/s that starts near the origin."""
     times = np.cumsum(rng.integers(50_000, 500_000, count))
     yaws = np.cumsum(rng.normal(scale=0.05, size=count))
     steps = np.diff(times, prepend=0)[:, None] * 8e-6
@@ -77,8 +77,7 @@ def planned(state: PlanarState, times: np.ndarray, poses: np.ndarray, vehicle=VE
 
 
 def bicycle(_t: float, state: np.ndarray, steering: float, acceleration: float) -> list[float]:
-    """Two-axle car on Fiala tyres, in the words of Pacejka (2012), ch. 1 and 3: brush model by
-    its sliding share, forces by axle, written without the kernel."""
+    """Two-axle car on Fiala tyres, after Pacejka (2012), ch. 1 and 3, independent of the kernel."""
     v = SLIPPING
     _, _, yaw, u, w, r = state
     weight = v.mass * GRAVITY
@@ -111,9 +110,7 @@ def bicycle(_t: float, state: np.ndarray, steering: float, acceleration: float) 
     steering=st.floats(-0.5, 0.5),
     acceleration=st.floats(-8, 4),
 )
-def test_slipping_tyres_move_the_car_as_a_fine_integration_does(
-    speed, sideways, turn, steering, acceleration
-):
+def test_slipping_tyres_match_a_fine_integration(speed, sideways, turn, steering, acceleration):
     state = np.array([3.0, -2.0, 0.4, speed, sideways, turn])
     exact = solve_ivp(
         bicycle, (0, 0.01), state, args=(steering, acceleration), rtol=1e-10, atol=1e-12
@@ -128,9 +125,9 @@ def test_slipping_tyres_move_the_car_as_a_fine_integration_does(
 
 @compiling
 @given(seed=seeds, count=st.integers(3, 12))
-def test_a_plans_tangents_are_slopes_of_parabolas_through_its_poses(seed, count):
+def test_plan_tangents_match_second_order_gradients(seed, count):
     times, poses = some_plan(np.random.default_rng(seed), count)
-    # Headings against the way are not trusted, so that the slopes stay as they are.
+    # Headings opposite to the path are ignored, so the slopes depend on positions only.
     poses[:, 2] += math.pi
     knots, _ = planned(state_of(speed=8.0), times, poses)
 
@@ -141,7 +138,7 @@ def test_a_plans_tangents_are_slopes_of_parabolas_through_its_poses(seed, count)
 
 @compiling
 @given(seed=seeds, count=st.integers(1, 12), share=st.floats(0, 0.999))
-def test_a_plan_is_the_hermite_spline_of_its_knots(seed, count, share):
+def test_a_plan_is_a_cubic_hermite_spline(seed, count, share):
     times, poses = some_plan(np.random.default_rng(seed), count)
     state = state_of(speed=7.0, y=0.3, yaw=0.1)
     knots, turn_rate = planned(state, times, poses)
@@ -155,7 +152,7 @@ def test_a_plan_is_the_hermite_spline_of_its_knots(seed, count, share):
     np.testing.assert_array_equal(knots[1:, 1:4], poses)
 
 
-def test_beyond_its_end_a_plan_goes_on_along_its_circle():
+def test_a_plan_continues_its_circle_beyond_the_end():
     radius, times = 25.0, np.arange(1, 11) * 100_000
     angles = 8.0 * times * 1e-6 / radius
     poses = np.column_stack([radius * np.sin(angles), radius * (1 - np.cos(angles)), angles])
@@ -176,7 +173,7 @@ def straight_plan(speed: float):
     return planned(state_of(speed=speed), times, poses)
 
 
-def test_the_regulator_has_the_gains_of_the_riccati_equation():
+def test_lqr_gains_solve_the_riccati_equation():
     speed, off = 12.0, 1e-4
     knots, turn_rate = straight_plan(speed)
     driver = (LQR, knots, turn_rate, 1.0, (0.0, 0.0), NO_SCHEDULE)
@@ -203,7 +200,7 @@ def test_the_regulator_has_the_gains_of_the_riccati_equation():
 
 @compiling
 @given(offset=st.floats(-2, 2), ahead=st.floats(0.5, 3))
-def test_pursuit_steers_the_arc_through_a_place_of_the_plan(offset, ahead):
+def test_pursuit_steers_an_arc_through_the_lookahead_point(offset, ahead):
     speed = 12.0
     knots, turn_rate = straight_plan(speed)
     state = state_of(x=speed * ahead, y=offset, speed=speed)
@@ -217,7 +214,7 @@ def test_pursuit_steers_the_arc_through_a_place_of_the_plan(offset, ahead):
 
 
 def costs_of(inputs: np.ndarray, start: PlanarState, wanted: np.ndarray) -> np.ndarray:
-    """What iLQR minimises, by rollouts of the kinematic bicycle: [N] of inputs [N, 2 * STEPS]."""
+    """iLQR cost [N] of inputs [N, 2 * STEPS], by rollouts of the kinematic bicycle."""
     commands = inputs.reshape(-1, STEPS, 2)
     first = [start.x, start.y, start.yaw, start.speed, start.steering, 0.0]
     x, y, yaw, speed, steering, none = np.repeat(np.array(first)[:, None], len(commands), axis=1)
@@ -233,7 +230,7 @@ def costs_of(inputs: np.ndarray, start: PlanarState, wanted: np.ndarray) -> np.n
 
 
 def cost_and_slope(inputs: np.ndarray, *about: Any) -> tuple[float, np.ndarray]:
-    """By central differences, all in one rollout."""
+    """Cost and its gradient by central differences, in one rollout."""
     step = 1e-6 * np.eye(len(inputs))
     cost, *moved = costs_of(np.vstack([inputs, inputs + step, inputs - step]), *about)
     ahead, behind = np.split(np.array(moved), 2)
@@ -241,7 +238,7 @@ def cost_and_slope(inputs: np.ndarray, *about: Any) -> tuple[float, np.ndarray]:
 
 
 @pytest.mark.parametrize(("y", "speed"), [(0.3, 10.0), (-0.6, 9.0), (0.0, 11.0)])
-def test_ilqr_finds_the_commands_that_a_general_optimiser_finds(y, speed):
+def test_ilqr_matches_a_general_optimiser(y, speed):
     start = state_of(x=3.0, y=y, speed=speed)
     knots, turn_rate = straight_plan(10.0)
     driver = (ILQR, knots, turn_rate, 0.3, (0.0, 0.0), NO_SCHEDULE)
@@ -263,11 +260,11 @@ def test_ilqr_finds_the_commands_that_a_general_optimiser_finds(y, speed):
     assert states[0, :2].tolist() == [3.0, y]
 
 
-# --- as they are written ----------------------------------------------------------------------
+# --- compiled and plain Python ----------------------------------------------------------------
 
 
 def some_drives() -> list[list[float]]:
-    """Vehicles of both kinds with and without delays, driven by every tracker."""
+    """Final states of both vehicle models, with and without delays, for every tracker."""
     rng = np.random.default_rng(0)
     delays = {"steering_delay_us": 120_000, "steering_lag": 0.1, "drive_delay_us": 50_000}
     found = []
@@ -289,7 +286,7 @@ def some_drives() -> list[list[float]]:
     return found
 
 
-def test_compiled_they_drive_as_they_do_in_plain_python():
+def test_compiled_kernels_match_plain_python():
     code = (
         f"import sys; sys.path.insert(0, {os.path.dirname(__file__)!r}); import test_driving, json"
     )
@@ -305,7 +302,7 @@ def test_compiled_they_drive_as_they_do_in_plain_python():
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
 
 
-def test_a_motion_begins_as_a_planar_state_does():
+def test_motion_starts_with_the_fields_of_planar_state():
     assert Motion._fields[: len(PlanarState._fields)] == PlanarState._fields
     assert Motion(1, 2, 3).numbers == tuple(PlanarState(1, 2, 3, 0, 0, 0, 0, 0, 0))
     assert Command._fields == ("acceleration", "steering")

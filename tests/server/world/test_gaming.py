@@ -1,4 +1,4 @@
-"""Planners that try to game the scores, and what a person would give them."""
+"""Planners that try to game the scores."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SCORES = ("pdms", "nuplan_cls", "hugsim_hd", "neuroncap", "carla_ds", "alpasim")
 
 @pytest.fixture(scope="module")
 def pulling_away() -> Trajectory:
-    """From rest with 2 m/s^2 up to 10 m/s."""
+    """A drive that accelerates from rest at 2 m/s^2 to 10 m/s."""
     times = np.arange(121) * 100_000
     t = times * 1e-6
     positions = np.zeros((121, 3))
@@ -32,7 +32,7 @@ def pulling_away() -> Trajectory:
 
 @pytest.fixture
 def judged(make_world, pulling_away):
-    """Scores of a planner of poses, and the world after its drive."""
+    """Run a pose planner: its scores and the final world."""
 
     def run(planner: Planner, **spec):
         world = make_world(pulling_away, spec={"action": "pose", "horizon": STEPS} | spec)
@@ -45,7 +45,7 @@ def judged(make_world, pulling_away):
 
 
 def way(step: int) -> float:
-    """Of the recorded drive [m]."""
+    """Distance covered by the recorded drive [m]."""
     t = step * DT
     return t * t if t < 5 else 10 * t - 25
 
@@ -59,7 +59,7 @@ def still(step: int) -> Pose:
 
 
 def hop(step: int) -> Pose:
-    """A metre sideways every second step."""
+    """Jump 1 m sideways every second step."""
     return way(step), float(step // 2 % 2), 0.0
 
 
@@ -68,17 +68,17 @@ def small_hop(step: int) -> Pose:
 
 
 def jump(step: int) -> Pose:
-    """Nothing, and all of the way in the last step."""
+    """Stand still and cover the whole distance in the last step."""
     return (way(STEPS) if step == STEPS else 0.0), 0.0, 0.0
 
 
 def teleport(step: int) -> Pose:
-    """Somewhere else for one step, then as if nothing had been."""
+    """Follow the recording except for one step far away."""
     return (200.0, 50.0, 1.0) if step == 30 else honest(step)
 
 
 def crab(step: int) -> Pose:
-    """Sideways into the next lane and on, the nose straight ahead."""
+    """Slide sideways without turning."""
     return way(step), min(0.05 * step * step * DT, 1.5), 0.0
 
 
@@ -87,7 +87,7 @@ def spin(step: int) -> Pose:
 
 
 def rush(step: int) -> Pose:
-    """15 m/s^2 from rest."""
+    """Accelerate at 15 m/s^2 from rest."""
     t = step * DT
     return min(7.5 * t * t, 15.0 * t), 0.0, 0.0
 
@@ -102,17 +102,17 @@ def backwards_at_full_speed(step: int) -> Pose:
 
 
 def off_road(step: int) -> Pose:
-    """In a wide turn off to the left."""
+    """Leave the road in a wide left turn."""
     s, radius = way(step), 40.0
     return radius * math.sin(s / radius), radius * (1 - math.cos(s / radius)), s / radius
 
 
 def oscillating(step: int) -> Pose:
-    """The recorded drive on average, swaying ahead and back by 0.3 m every second."""
+    """The recorded drive with a longitudinal oscillation of 0.3 m at 1 Hz."""
     return way(step) + 0.3 * math.sin(math.tau * step * DT) * min(step / 20, 1.0), 0.0, 0.0
 
 
-def test_the_recorded_drive_gets_everything(judged):
+def test_the_recorded_drive_gets_full_scores(judged):
     found, world = judged(honest)
 
     assert {n: found[n].value for n in SCORES} == pytest.approx(
@@ -124,7 +124,7 @@ def test_the_recorded_drive_gets_everything(judged):
 @pytest.mark.parametrize(
     "planner", [hop, small_hop, jump, teleport, spin, crab, rush, backwards_at_full_speed]
 )
-def test_what_no_car_can_do_is_worth_nothing(judged, planner):
+def test_infeasible_motion_scores_zero(judged, planner):
     found, world = judged(planner)
 
     assert {n: found[n].value for n in SCORES} == dict.fromkeys(SCORES, 0.0)
@@ -134,14 +134,14 @@ def test_what_no_car_can_do_is_worth_nothing(judged, planner):
     assert found["feasible"].terms["infeasible_steps"] >= 1
 
 
-def test_the_step_from_which_on_nothing_counts_is_named(judged):
+def test_the_first_infeasible_step_is_reported(judged):
     found, _ = judged(jump)
 
     assert found["feasible"].terms == {"infeasible_steps": 1.0, "first_s": pytest.approx(6.0)}
 
 
 @pytest.mark.parametrize("dt_us", [20_000, 50_000, 200_000, 500_000, 1_000_000])
-def test_the_clock_changes_nothing_about_what_a_car_can_do(make_world, pulling_away, dt_us):
+def test_feasibility_does_not_depend_on_the_time_step(make_world, pulling_away, dt_us):
     steps = 6_000_000 // dt_us
 
     def drive(pose_at: Callable[[float], Pose]) -> float:
@@ -157,17 +157,17 @@ def test_the_clock_changes_nothing_about_what_a_car_can_do(make_world, pulling_a
     assert drive(lambda t: (way(t / DT), 4.0 * (t > 3.9), 0.0)) == 0.0
 
 
-def test_standing_still_makes_no_way_and_is_worth_that(judged):
+def test_standing_still_earns_no_progress(judged):
     found, _ = judged(still)
 
-    # NAVSIM's formula gives 7 of 12 to a drive that is safe and comfortable and goes nowhere.
+    # NAVSIM's formula gives 7/12 to a safe, comfortable drive without progress.
     values = {n: found[n].value for n in SCORES}
     expected = {"pdms": 7 / 12, "nuplan_cls": 0, "hugsim_hd": 0, "carla_ds": 0, "alpasim": 0}
     assert values == pytest.approx(expected | {"neuroncap": 5.0})
     assert "standing still while the recorded drive covers 35 m" in found["neuroncap"].cannot_see
 
 
-def test_driving_backwards_is_worth_no_more_than_standing(judged):
+def test_driving_backwards_scores_no_more_than_standing(judged):
     found, _ = judged(backwards)
 
     assert found["feasible"].value == 1.0
@@ -177,7 +177,7 @@ def test_driving_backwards_is_worth_no_more_than_standing(judged):
     assert "against the route" in found["pdms"].cannot_see
 
 
-def test_leaving_the_road_is_worth_nothing_where_a_score_sees_the_road(judged):
+def test_leaving_the_road_lowers_scores_that_see_the_road(judged):
     found, _ = judged(off_road)
 
     assert found["feasible"].value == 1.0
@@ -189,7 +189,7 @@ def test_leaving_the_road_is_worth_nothing_where_a_score_sees_the_road(judged):
 
 
 def around(way: float, *, turn_at: float, radius: float = 12.0) -> Pose:
-    """Out along x, round to the left and back."""
+    """Drive along x, make a U-turn to the left and return."""
     if way < turn_at:
         return way, 0.0, 0.0
     if way < turn_at + math.pi * radius:
@@ -198,7 +198,7 @@ def around(way: float, *, turn_at: float, radius: float = 12.0) -> Pose:
     return turn_at - (way - turn_at - math.pi * radius), 2 * radius, math.pi
 
 
-def test_a_short_cut_is_no_way_along_the_route(make_world):
+def test_a_short_cut_does_not_count_as_route_progress(make_world):
     times = np.arange(200) * 100_000
     out_and_back = np.array([around(0.8 * k, turn_at=60.0) for k in range(200)])
     places = np.column_stack([out_and_back[:, :2], np.zeros(200)])
@@ -220,7 +220,7 @@ def test_a_short_cut_is_no_way_along_the_route(make_world):
     assert "skipped by a shortcut" in cut["neuroncap"].cannot_see
 
 
-def test_a_drive_without_a_step_has_no_scores(judged, make_world, pulling_away):
+def test_scores_are_missing_before_the_first_step(judged, make_world, pulling_away):
     world = make_world(pulling_away, spec={"action": "pose", "horizon": STEPS})
 
     scores = world.scores()
@@ -228,7 +228,7 @@ def test_a_drive_without_a_step_has_no_scores(judged, make_world, pulling_away):
     assert {s.missing for s in scores} == {("a step that counts",)}
 
 
-def test_who_ends_early_is_told_that_the_rest_was_not_seen(make_world, pulling_away, judged):
+def test_scores_of_an_unfinished_episode_name_the_unseen_part(make_world, pulling_away, judged):
     world = make_world(pulling_away, spec={"action": "pose", "horizon": STEPS})
     for step in range(1, 11):
         x, y, yaw = honest(step)
@@ -241,7 +241,7 @@ def test_who_ends_early_is_told_that_the_rest_was_not_seen(make_world, pulling_a
     assert "following closely" in whole["pdms"].cannot_see
 
 
-def test_oscillating_costs_comfort(judged):
+def test_oscillation_lowers_comfort(judged):
     found, _ = judged(oscillating)
     quiet, _ = judged(honest)
 
@@ -250,9 +250,7 @@ def test_oscillating_costs_comfort(judged):
         assert found[name].value < quiet[name].value - 0.05, name
 
 
-def test_a_planner_that_lets_itself_be_put_anywhere_is_judged_like_one_of_poses(
-    make_world, pulling_away
-):
+def test_jumps_of_the_perfect_tracker_are_infeasible(make_world, pulling_away):
     world = make_world(pulling_away, spec={"horizon": STEPS, "ego": {"tracker": "perfect"}})
     for step in range(STEPS):
         poses = [hop(step + k) for k in range(1, 11)]
@@ -264,7 +262,7 @@ def test_a_planner_that_lets_itself_be_put_anywhere_is_judged_like_one_of_poses(
 
 
 @pytest.mark.parametrize("dynamics", ["kinematic_bicycle", "dynamic_bicycle"])
-def test_what_a_vehicle_model_drives_is_what_a_car_can_do(make_world, moving, dynamics):
+def test_vehicle_models_drive_feasibly(make_world, moving, dynamics):
     spec = {"action": "control", "horizon": STEPS, "ego": {"dynamics": dynamics}}
     world = make_world(moving(speed=12.0), spec=spec)
     for step in range(STEPS):
@@ -274,7 +272,7 @@ def test_what_a_vehicle_model_drives_is_what_a_car_can_do(make_world, moving, dy
     assert world.metrics()["feasible"] == 1.0
 
 
-def test_being_put_back_to_the_start_of_a_loop_is_no_jump(make_world):
+def test_the_seam_of_a_loop_is_feasible(make_world):
     times = np.arange(121) * 100_000
     angle, radius = times * 1e-6 * 10.0 / 120.0, 120.0
     places = [radius * np.sin(angle), radius * (1 - np.cos(angle)), np.zeros(121)]
@@ -289,7 +287,7 @@ def test_being_put_back_to_the_start_of_a_loop_is_no_jump(make_world):
     assert world.metrics()["feasible"] == 1.0
 
 
-def test_an_impact_is_nothing_that_the_ego_did(make_world, moving):
+def test_an_impact_is_feasible(make_world, moving):
     spec = {"action": "control", "horizon": STEPS, "on_collision": "continue"}
     world = make_world(moving(speed=15.0), car=moving(25, 0.6, z=0.8), spec=spec)
     for _ in range(STEPS):
@@ -299,7 +297,7 @@ def test_an_impact_is_nothing_that_the_ego_did(make_world, moving):
     assert world.metrics()["feasible"] == 1.0
 
 
-def test_every_score_says_in_one_sentence_what_it_cannot_see(judged):
+def test_every_score_states_what_it_cannot_see(judged):
     found, _ = judged(honest)
 
     for name, score in found.items():
@@ -311,8 +309,8 @@ def test_every_score_says_in_one_sentence_what_it_cannot_see(judged):
     assert "lane keeping" in found["pdms"].cannot_see
 
 
-def test_poses_of_the_planners_are_what_their_names_say():
-    # No test above passes for want of motion.
+def test_planners_move_as_named():
+    # The planners above move as intended.
     assert all(b[0] >= a[0] for a, b in pairwise(map(honest, range(STEPS))))
     assert backwards(STEPS)[0] < -10
     assert off_road(STEPS)[1] > 5

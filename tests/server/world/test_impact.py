@@ -1,4 +1,4 @@
-"""Bodies that meet: momentum, what becomes of it, and what is reported."""
+"""Impacts: momentum, sliding to rest and reported values."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ PAIRS = [
 @pytest.mark.parametrize(("a", "b"), PAIRS)
 @pytest.mark.parametrize("restitution", [0.0, 0.3, 1.0])
 @pytest.mark.parametrize("friction", [0.0, 0.5])
-def test_momentum_is_kept_and_energy_never_gained(a, b, restitution, friction):
+def test_momentum_is_conserved_and_energy_does_not_grow(a, b, restitution, friction):
     c, d = after_impact(a, b, restitution=restitution, friction=friction)
     before = a.energy(CAR) + b.energy(CAR)
     np.testing.assert_allclose(momentum((c, CAR), (d, CAR)), momentum((a, CAR), (b, CAR)))
@@ -73,7 +73,7 @@ def test_momentum_is_kept_and_energy_never_gained(a, b, restitution, friction):
 
 
 @pytest.mark.parametrize("restitution", [0.0, 0.4, 1.0])
-def test_a_central_impact_is_that_of_the_textbook(restitution):
+def test_a_central_impact_matches_the_textbook(restitution):
     a, b = PAIRS[0]
     c, d = after_impact(a, b, restitution=restitution, friction=0.5)
     assert c.vx == pytest.approx(10 * (1 - restitution) / 2)
@@ -81,19 +81,19 @@ def test_a_central_impact_is_that_of_the_textbook(restitution):
     assert (c.turn, d.turn) == pytest.approx((0.0, 0.0), abs=1e-9)
 
 
-def test_an_impact_off_centre_turns_both():
+def test_an_offset_impact_turns_both_bodies():
     c, d = after_impact(*PAIRS[1], restitution=0.1, friction=0.0)
     assert c.turn < -0.1
     assert d.turn < -0.1
 
 
-def test_bodies_that_part_exchange_nothing():
+def test_separating_bodies_exchange_no_impulse():
     a, b = BodyState(0, 0, 0, 0, 0, 0), BodyState(4.4, 0, 0, 5, 0, 0)
     where = contact_manifold(corners(a, CAR), corners(b, CAR))
     assert contact_impulse((a, CAR), (b, CAR), where, restitution=0.1, friction=0.5) is None
 
 
-def test_boxes_that_are_apart_do_not_touch():
+def test_only_overlapping_boxes_have_a_contact_manifold():
     assert (
         contact_manifold(
             corners(BodyState(0, 0, 0, 0, 0, 0), CAR), corners(BodyState(4.6, 0, 0, 0, 0, 0), CAR)
@@ -110,7 +110,7 @@ def test_boxes_that_are_apart_do_not_touch():
 # --- sliding to rest --------------------------------------------------------------------------
 
 
-def test_a_body_without_wheels_slides_as_far_as_friction_says():
+def test_sliding_distance_of_a_body_without_wheels_matches_friction():
     body, solid = BodyState(0, 0, 0, 10, 0, 0), BodyProperties(80.0, 5.0, 0.5, 0.5, friction=0.7)
     for _ in range(400):
         body = integrate_sliding(body, solid, 0.01)
@@ -118,7 +118,7 @@ def test_a_body_without_wheels_slides_as_far_as_friction_says():
     assert body.x == pytest.approx(10**2 / (2 * 0.7 * 9.81), rel=0.03)
 
 
-def test_a_car_slides_sideways_as_far_as_its_tyres_say():
+def test_sideways_sliding_distance_matches_tyre_friction():
     solid = BodyProperties(1500.0, 2500.0, 4.5, 1.8, axles=(1.35, 1.35), friction=0.8)
     body = BodyState(0, 0, math.pi / 2, 8, 0, 0)
     for _ in range(400):
@@ -148,9 +148,7 @@ def rear_end(make_world, moving, *, mass: float = MASS, restitution: float = 0.1
 
 
 @pytest.mark.parametrize(("mass", "restitution"), [(1500.0, 0.1), (3000.0, 0.0), (800.0, 0.3)])
-def test_a_rear_end_at_10_metres_a_second_gives_the_delta_v_of_theory(
-    make_world, moving, mass, restitution
-):
+def test_delta_v_of_a_rear_end_impact_matches_theory(make_world, moving, mass, restitution):
     # delta-v = (1 + e) m2 / (m1 + m2) v.
     world = rear_end(make_world, moving, mass=mass, restitution=restitution)
     (event,) = drive_until_contact(world)
@@ -165,7 +163,7 @@ def test_a_rear_end_at_10_metres_a_second_gives_the_delta_v_of_theory(
     assert crash.value == pytest.approx(theory, rel=0.1)
 
 
-def test_both_cars_move_on_and_the_one_that_was_hit_comes_to_rest(make_world, moving):
+def test_both_cars_move_on_and_come_to_rest(make_world, moving):
     world = rear_end(make_world, moving)
     drive_until_contact(world)
     total = MASS * (world.motion.speed + agent_of(world)["velocity"][0])
@@ -178,13 +176,13 @@ def test_both_cars_move_on_and_the_one_that_was_hit_comes_to_rest(make_world, mo
     assert world.motion.speed == pytest.approx(0.0, abs=0.05)
 
 
-def test_the_energy_that_is_lost_is_reported_with_an_estimate_of_crush(make_world, moving):
+def test_lost_energy_and_crush_are_reported(make_world, moving):
     (event,) = drive_until_contact(rear_end(make_world, moving, restitution=0.0))
     assert event.data["energy"] == pytest.approx(0.5 * MASS / 2 * 10**2, rel=0.1)
     assert 0.3 < event.data["crush"] < 0.6
 
 
-def test_a_car_hit_off_centre_turns_and_so_does_the_ego(make_world, moving):
+def test_an_offset_hit_turns_the_car_and_the_ego(make_world, moving):
     world = make_world(car=moving(20, 1.2, z=0.8), spec=GO_ON)
     drive_until_contact(world)
     for _ in range(15):
@@ -194,7 +192,7 @@ def test_a_car_hit_off_centre_turns_and_so_does_the_ego(make_world, moving):
     assert abs(world.motion.yaw) > 0.015
 
 
-def test_a_car_that_was_hit_hits_the_next(make_world, moving):
+def test_a_struck_car_hits_the_next(make_world, moving):
     world = make_world(car=moving(20, 0, z=0.8), next=moving(24.5, 0, z=0.8), spec=GO_ON)
     pairs = []
     for _ in range(40):
@@ -205,14 +203,14 @@ def test_a_car_that_was_hit_hits_the_next(make_world, moving):
     assert {s.name: s for s in world.scores()}["delta_v"].terms["secondary_collisions"] >= 1
 
 
-def test_masses_given_by_an_edit_count(make_world, moving):
+def test_edited_masses_affect_the_impact(make_world, moving):
     light, heavy = (make_world(car=moving(20, 0, z=0.8), spec=GO_ON) for _ in range(2))
     heavy.apply([SetPhysics(object_id="car", mass=20_000.0)])
     (a,), (b,) = drive_until_contact(light), drive_until_contact(heavy)
     assert b.data["delta_v"] > 1.3 * a.data["delta_v"]
 
 
-def test_cars_that_overlap_in_the_recording_do_not_explode(make_world, moving):
+def test_cars_that_overlap_in_the_recording_are_not_flung_apart(make_world, moving):
     world = make_world(car=moving(20, 0, z=0.8), beside=moving(20.5, 1.5, z=0.8), spec=GO_ON)
     drive_until_contact(world)
     for _ in range(10):
@@ -221,7 +219,7 @@ def test_cars_that_overlap_in_the_recording_do_not_explode(make_world, moving):
         assert math.hypot(*agent_of(world, name)["velocity"][:2]) < 10.0
 
 
-def test_the_same_crash_gives_the_same_bits(make_world, moving):
+def test_crashes_are_reproducible(make_world, moving):
     def crash() -> list:
         world = make_world(car=moving(20, 0.7, z=0.8), next=moving(26, 0, z=0.8), spec=GO_ON)
         for _ in range(40):
@@ -253,7 +251,7 @@ def wall_scene(make_scene, x: float):
 
 
 def moving_stub(scene):
-    """The recorded drive ends before the wall."""
+    """A recorded drive that ends before the wall."""
     from real2sim_server.scene import Trajectory
 
     ego = scene.ego
@@ -261,7 +259,7 @@ def moving_stub(scene):
 
 
 @pytest.mark.parametrize("on_collision", ["terminate", "continue"])
-def test_a_wall_of_the_background_is_hit(make_scene, on_collision):
+def test_a_background_wall_is_hit(make_scene, on_collision):
     from real2sim_proto.episode import ResetSpec
     from real2sim_server.edit import ScenarioState
     from real2sim_server.world import World

@@ -1,4 +1,4 @@
-"""Kernels of a step against plain NumPy."""
+"""Kernels of a step against plain NumPy implementations."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ NOW, SECOND = 4_000_000, 1_000_000
 SIZE = (4.6, 1.85, 1.6)
 seeds = st.integers(0, 10_000)
 compiling = settings(deadline=None)
-"""The first example waits for the compiler."""
+"""No deadline: the first example compiles the kernel."""
 
 
 def some_boxes(rng: np.random.Generator, count: int, *, spread: float):
@@ -66,7 +66,7 @@ def some_path(rng: np.random.Generator) -> np.ndarray:
 
 @compiling
 @given(seed=seeds, x=st.floats(-50, 100), y=st.floats(-50, 50))
-def test_the_nearest_point_is_nearer_than_all_points_of_a_fine_sampling(seed, x, y):
+def test_the_nearest_point_matches_a_fine_sampling(seed, x, y):
     knots = some_path(np.random.default_rng(seed))
     s, offset, (px, py, pz), yaw, up = path.nearest_point(knots, x, y, math.nan)
     at = np.arange(0.0, knots[-1, 0], 0.01)
@@ -86,7 +86,7 @@ def test_the_nearest_point_is_nearer_than_all_points_of_a_fine_sampling(seed, x,
 
 @compiling
 @given(seed=seeds, s=st.floats(-5, 120), reach=st.floats(0, 60))
-def test_the_sharpest_turn_is_that_of_the_headings_every_four_metres(seed, s, reach):
+def test_the_sharpest_turn_uses_headings_4_metres_apart(seed, s, reach):
     knots = some_path(np.random.default_rng(seed))
     at = s + np.arange(0.0, max(reach, 8.0) + 4.0, 4.0)
     expected = np.abs(np.diff(np.interp(at, knots[:, 0], knots[:, 4]))).max() / 4
@@ -118,7 +118,7 @@ def leader_by_numpy(knots, s, box, bodies, own) -> tuple[float, float]:
 
 @compiling
 @given(seed=seeds, count=st.integers(1, 12), s=st.floats(0, 80), offset=st.floats(-2, 2))
-def test_the_next_in_a_strip_is_the_nearest_of_those_that_block_it(seed, count, s, offset):
+def test_the_leader_is_the_nearest_object_in_the_strip(seed, count, s, offset):
     rng = np.random.default_rng(seed)
     knots = some_path(rng)
     on_it = rng.integers(0, len(knots), count)
@@ -135,7 +135,7 @@ def test_the_next_in_a_strip_is_the_nearest_of_those_that_block_it(seed, count, 
 
 @compiling
 @given(seed=seeds, s=st.floats(-5, 120))
-def test_waypoints_are_places_of_the_path_in_the_vehicle_frame(seed, s):
+def test_waypoints_are_path_points_in_the_vehicle_frame(seed, s):
     rng = np.random.default_rng(seed)
     knots, (x, y, yaw) = some_path(rng), rng.normal(scale=5.0, size=3).tolist()
     found = path.waypoints(knots, s, (x, y, yaw), 20, 2.0)
@@ -157,7 +157,7 @@ def overlapping(box: np.ndarray, transforms: np.ndarray, sizes: np.ndarray) -> l
 
 @compiling
 @given(seed=seeds, count=st.integers(0, 30))
-def test_all_boxes_that_overlap_are_within_reach(seed, count):
+def test_overlapping_boxes_are_within_reach(seed, count):
     rng = np.random.default_rng(seed)
     positions, _, _, sizes = some_boxes(rng, count, spread=4.0)
     transforms = transform_from(positions, rng.normal(size=(count, 4)))
@@ -172,7 +172,7 @@ def test_all_boxes_that_overlap_are_within_reach(seed, count):
 
 @compiling
 @given(seed=seeds)
-def test_boxes_that_overlap_soon_may_overlap(seed):
+def test_may_overlap_finds_boxes_that_overlap_after_the_step(seed):
     rng = np.random.default_rng(seed)
     positions, quaternions, velocities, sizes = some_boxes(rng, 5, spread=6.0)
     ego = (0.0, 0.0, float(rng.uniform(-7, 7)), 8.0, 0.0, 0.0)
@@ -185,7 +185,7 @@ def test_boxes_that_overlap_soon_may_overlap(seed):
     assert may or not meets
 
 
-def test_boxes_far_away_may_not_overlap():
+def test_may_overlap_excludes_distant_boxes():
     boxes = some_boxes(np.random.default_rng(0), 20, spread=3.0)
     boxes[0][:, 0] += 60.0
 
@@ -194,7 +194,7 @@ def test_boxes_far_away_may_not_overlap():
     assert not world_boxes.may_overlap((0.0, 0.0, 0.0, 8.0, 0.0, 0.0), SIZE, 0.1, *nobody)
 
 
-def test_headings_are_those_of_quaternions():
+def test_headings_match_quaternion_yaw():
     quaternions = np.random.default_rng(0).normal(size=(50, 4))
 
     found = world_boxes.headings(quaternions)
@@ -214,7 +214,7 @@ def some_lines(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.nda
 
 @compiling
 @given(seed=seeds, lanes=st.integers(0, 4), far=st.sampled_from([1.0, 20.0, 2000.0]))
-def test_off_road_is_the_distance_to_all_lines_less_their_half_widths(seed, lanes, far):
+def test_off_road_distance_subtracts_the_half_widths_of_lanes(seed, lanes, far):
     rng = np.random.default_rng(seed)
     route, others = some_lines(rng, 1), some_lines(rng, lanes)
     x, y, yaw = (rng.normal(scale=far, size=3)).tolist()
@@ -238,7 +238,7 @@ def test_off_road_is_the_distance_to_all_lines_less_their_half_widths(seed, lane
 
 
 def first_meeting_by_sampling(ego, everywhere: bool, others) -> int:
-    """The definition: boxes on the ego's level, in its bearings, moved on step by step."""
+    """Reference: move all boxes step by step, at the ego's height and within its bearings."""
     x, y, yaw, forward, lateral, z = ego
     heading = np.array([math.cos(yaw), math.sin(yaw)])
     velocity = forward * heading + lateral * np.array([-heading[1], heading[0]])
@@ -260,7 +260,7 @@ def first_meeting_by_sampling(ego, everywhere: bool, others) -> int:
 
 @pytest.mark.parametrize("everywhere", [False, True])
 @pytest.mark.parametrize("seed", range(15))
-def test_the_first_meeting_is_that_of_boxes_moved_step_by_step(seed, everywhere):
+def test_the_first_overlap_matches_a_step_by_step_search(seed, everywhere):
     rng = np.random.default_rng(seed)
     positions, quaternions, velocities, sizes = some_boxes(rng, seed % 6, spread=15.0)
     planar = np.ascontiguousarray(velocities[:, :2])
@@ -272,7 +272,7 @@ def test_the_first_meeting_is_that_of_boxes_moved_step_by_step(seed, everywhere)
     assert found == first_meeting_by_sampling(ego, everywhere, others)
 
 
-def test_objects_that_are_ignored_are_not_met():
+def test_ignored_objects_do_not_overlap():
     others = (np.array([[8.0, 0, 0]]), np.zeros(1), np.full((1, 3), 2.0), np.zeros((1, 2)))
     ego = (0.0, 0.0, 0.0, 5.0, 0.0, -0.5)
 
@@ -288,7 +288,7 @@ def test_objects_that_are_ignored_are_not_met():
 
 @compiling
 @given(seed=seeds, count=st.integers(0, 12), window=st.integers(1, 9))
-def test_windows_keep_the_last_values(seed, count, window):
+def test_a_window_keeps_the_last_values(seed, count, window):
     values = np.random.default_rng(seed).normal(size=(count, 2))
     kept, total = comfort.windowed_sum(values[:, 0].copy(), 3.0, window)
     np.testing.assert_array_equal(kept, np.append(values[:, 0], 3.0)[-window:])
@@ -305,7 +305,7 @@ def test_derivatives_are_weighted_sums():
 
 
 @pytest.mark.parametrize("history", [0, 3, 40])
-def test_comfort_looked_at_once_is_that_of_both(history):
+def test_shared_comfort_updates_match_separate_ones(history):
     dt, numbers = 0.1, np.random.default_rng(history).normal(size=(60 + history, 2))
     with_history = ComfortAccumulator()
     for speed, yaw in numbers[:history].tolist():
@@ -326,7 +326,7 @@ def test_comfort_looked_at_once_is_that_of_both(history):
 
 @compiling
 @given(yaws=st.lists(st.floats(-20, 20) | st.just(math.pi), min_size=1, max_size=10))
-def test_yaws_become_continuous_as_by_unwrapping(yaws):
+def test_continuous_yaws_match_unwrap(yaws):
     poses = np.zeros((len(yaws), 3))
     poses[:, 2] = yaws
     comfort.make_continuous(poses)
@@ -354,7 +354,7 @@ def plans_alike_by_numpy(before: PlannedTrajectory, now: PlannedTrajectory) -> b
 
 @compiling
 @given(seed=seeds, scale=st.sampled_from([0.0, 1e-4, 1e-3, 1e-2]))
-def test_plans_are_alike_when_their_derivatives_are(seed, scale):
+def test_plans_agree_when_their_derivatives_agree(seed, scale):
     rng = np.random.default_rng(seed)
     notes = []
     for _ in range(2):
@@ -385,7 +385,7 @@ PLANS = {
     [*(("trajectory", ego) for ego in EGOS), ("control", {}), ("control", DELAYED), ("pose", {})],
 )
 @pytest.mark.parametrize(("on_collision", "default"), [("continue", "log"), ("terminate", "idm")])
-def test_steps_and_edits_after_the_warm_up_compile_nothing(
+def test_steps_and_edits_compile_nothing_after_the_warm_up(
     make_world, moving, action, ego, on_collision, default
 ):
     warm_up()

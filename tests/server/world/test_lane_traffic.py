@@ -1,4 +1,4 @@
-"""Traffic on the lanes of a map: closed forms of the intelligent driver model, and MOBIL."""
+"""Traffic on map lanes: closed forms of the intelligent driver model, and MOBIL."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ TWO = LaneGraph.of([lane("own", 0.0, left="fast"), lane("fast", 3.5, right="own"
 
 @pytest.fixture
 def driven(make_world, moving):
-    """A world on a map with cars by id, each with a driver on lanes; the ego stands far aside."""
+    """Make a world with cars that follow map lanes. The ego stands 40 m beside the road."""
 
     def make(graph: LaneGraph | None, drivers: dict, **cars) -> World:
         made = make_world(moving(0, -40), **cars)
@@ -46,7 +46,7 @@ def driven(make_world, moving):
 
 
 def seen(world: World, name: str) -> tuple[np.ndarray, float]:
-    """Place and speed."""
+    """Position [m] and speed [m/s] of an object."""
     k = [o.object_id for o in world.agents.objects].index(name)
     return world.agents.positions[k], float(np.hypot(*world.agents.velocities[k, :2]))
 
@@ -64,7 +64,7 @@ def gap(world: World) -> float:
 # --- the intelligent driver model -------------------------------------------------------------
 
 
-def test_the_gap_behind_a_steady_leader_is_that_of_equilibrium(driven, moving):
+def test_the_gap_behind_a_steady_leader_is_the_equilibrium_gap(driven, moving):
     """Treiber et al. 2000, equation 4: s = (s0 + v T) / sqrt(1 - (v / v0)^4)."""
     drivers = {"lead": {"desired_speed": 8.0}, "car": {"desired_speed": 12.0}}
     cars = {"lead": moving(60, 0, z=0.8, speed=8.0), "car": moving(20, 0, z=0.8, speed=8.0)}
@@ -74,7 +74,7 @@ def test_the_gap_behind_a_steady_leader_is_that_of_equilibrium(driven, moving):
     assert gap(world) == pytest.approx(wanted / math.sqrt(1 - (v / 12.0) ** 4), rel=0.01)
 
 
-def test_it_stops_behind_who_stands_at_the_gap_of_standstill(driven, moving):
+def test_a_car_stops_at_the_standstill_gap_behind_a_stopped_leader(driven, moving):
     world = driven(
         ONE,
         {"car": {"desired_speed": 10.0}},
@@ -84,11 +84,11 @@ def test_it_stops_behind_who_stands_at_the_gap_of_standstill(driven, moving):
     speeds = [seen(after(world, 0.1), "car")[1] for _ in range(500)]
     braking = -np.diff(speeds).min() / 0.1
     assert gap(world) == pytest.approx(SPEC.gap, abs=0.05)
-    # Where there is room it ends with comfortable braking, neither less nor harder.
+    # With enough room it brakes at the comfortable deceleration.
     assert 0.6 * SPEC.braking < braking < 1.05 * SPEC.braking
 
 
-def test_a_free_road_is_driven_at_the_limit_of_its_lane(driven, moving):
+def test_free_flow_speed_is_the_limit_of_the_lane(driven, moving):
     limited = LaneGraph.of([lane("own", 0.0, speed_limit=9.0)])
     cars = {"car": moving(0, 0, z=0.8, speed=5.0)}
     world = after(driven(limited, {"car": {}}, **cars), 40.0)
@@ -97,7 +97,7 @@ def test_a_free_road_is_driven_at_the_limit_of_its_lane(driven, moving):
     assert seen(world, "car")[1] == pytest.approx(5.0, abs=0.05)
 
 
-def test_lanes_are_followed_one_after_the_other_and_the_world_is_left_at_their_end(driven, moving):
+def test_a_car_follows_successor_lanes_and_disappears_at_the_end(driven, moving):
     turn = np.linspace(0, np.pi / 2, 20)
     bend = np.column_stack([60 + 30 * np.sin(turn), 30 - 30 * np.cos(turn), 0 * turn])
     up = np.column_stack([np.full(9, 90.0), np.linspace(30, 110, 9), np.zeros(9)])
@@ -127,14 +127,14 @@ def test_lanes_are_followed_one_after_the_other_and_the_world_is_left_at_their_e
 
 
 def idm(v: float, v0: float, s: float = math.inf, leader: float = 0.0) -> float:
-    """As published, in its own words."""
+    """Acceleration of the intelligent driver model, as published."""
     a, b = SPEC.acceleration, SPEC.braking
     wanted = SPEC.gap + max(0.0, v * SPEC.headway + v * (v - leader) / (2 * math.sqrt(a * b)))
     return a * (1 - (v / v0) ** 4 - (wanted / s) ** 2)
 
 
-def test_the_incentive_is_that_of_the_paper():
-    """Kesting et al. 2007, equation 3, both followers there."""
+def test_the_incentive_matches_the_mobil_paper():
+    """Kesting et al. 2007, equation 3, with both followers present."""
     v, v0, length = 10.0, 12.0, 4.0
     here = Neighbours(Leader(15.0, 7.0), Leader(25.0, 9.0))
     there = Neighbours(Leader(60.0, 11.0), Leader(30.0, 10.0))
@@ -145,8 +145,8 @@ def test_the_incentive_is_that_of_the_paper():
     assert found == pytest.approx(own + SPEC.politeness * (new + old) - SPEC.threshold)
 
 
-def test_who_would_brake_too_hard_is_not_cut_off():
-    """Equation 2: the new follower's acceleration stays above -b_safe; and it is the limit."""
+def test_lane_changes_that_force_hard_braking_are_unsafe():
+    """Equation 2: the new follower's acceleration stays above -b_safe."""
     slow = (Neighbours(Leader(10.0, 3.0), None), 12.0)
 
     def there(gap: float) -> tuple[Neighbours, float]:
@@ -159,7 +159,7 @@ def test_who_would_brake_too_hard_is_not_cut_off():
     assert incentive(SPEC, 10.0, 4.0, here=slow, there=beside) is None
 
 
-def test_the_polite_leave_a_gain_that_costs_others_more():
+def test_politeness_lowers_the_incentive():
     here = (Neighbours(Leader(35.0, 10.0), None), 12.0)
     there = (Neighbours(None, Leader(20.0, 10.0)), 12.0)
     selfish, polite = (
@@ -168,15 +168,15 @@ def test_the_polite_leave_a_gain_that_costs_others_more():
     assert polite < 0.0 < selfish
 
 
-def test_nothing_is_gained_between_two_free_lanes():
+def test_two_free_lanes_give_no_incentive():
     found = incentive(SPEC, 10.0, 4.0, here=(FREE, 12.0), there=(FREE, 12.0))
     assert found == pytest.approx(-SPEC.threshold)
 
 
-# --- changes of lanes in a world ----------------------------------------------------------------
+# --- lane changes in a world --------------------------------------------------------------------
 
 
-def test_a_slow_leader_is_overtaken_in_the_other_lane(driven, moving):
+def test_a_slow_leader_is_overtaken(driven, moving):
     cars = {"lead": moving(40, 0, z=0.8, speed=4.0), "car": moving(0, 0, z=0.8, speed=10.0)}
     drivers = {"lead": {"desired_speed": 4.0, "changes": False}, "car": {"desired_speed": 10.0}}
     world = driven(TWO, drivers, **cars)
@@ -185,9 +185,9 @@ def test_a_slow_leader_is_overtaken_in_the_other_lane(driven, moving):
         world.step(COAST)
         aside.append(seen(world, "car")[0][1])
         if began is None and world.traffic.drivers["car"].changing:
-            began = k - 1  # the step before it has moved aside
+            began = k - 1  # the previous step started the change
     assert began is not None
-    # A quintic: half of the way in half of its time, the highest acceleration 5.77 d / T^2.
+    # A quintic covers half the distance in half the time; peak acceleration 5.77 d / T^2.
     change = round(SPEC.change_time / 0.1)
     assert aside[began + change // 2] == pytest.approx(1.75, abs=0.05)
     assert aside[began + change] == pytest.approx(3.5, abs=0.01)
@@ -196,8 +196,8 @@ def test_a_slow_leader_is_overtaken_in_the_other_lane(driven, moving):
     assert world.accumulator.collisions == 0
 
 
-def test_two_that_make_way_for_each_other_do_not_do_so_for_ever(driven, moving):
-    """By MOBIL the slow one moves over, too, where somebody fast comes behind."""
+def test_two_cars_do_not_swap_lanes_forever(driven, moving):
+    """MOBIL also makes a slow leader change lanes for a fast follower."""
     cars = {"lead": moving(40, 0, z=0.8, speed=4.0), "car": moving(0, 0, z=0.8, speed=10.0)}
     world = driven(TWO, {"lead": {"desired_speed": 4.0}, "car": {"desired_speed": 10.0}}, **cars)
     changes, before = 0, dict.fromkeys(cars, False)
@@ -213,7 +213,7 @@ def test_two_that_make_way_for_each_other_do_not_do_so_for_ever(driven, moving):
 
 
 @pytest.mark.parametrize("why", ["told", "marks", "traffic"])
-def test_who_may_not_change_keeps_behind(driven, moving, why):
+def test_a_car_that_cannot_change_lanes_follows_its_leader(driven, moving, why):
     cars = {"lead": moving(30, 0, z=0.8, speed=4.0), "car": moving(0, 0, z=0.8, speed=8.0)}
     graph, fields = TWO, {"desired_speed": 10.0}
     if why == "told":
@@ -230,7 +230,7 @@ def test_who_may_not_change_keeps_behind(driven, moving, why):
     assert abs(seen(world, "car")[0][1]) < 0.01
 
 
-def test_a_lane_that_ends_is_left_for_the_one_that_goes_on(driven, moving):
+def test_a_car_leaves_a_lane_that_ends(driven, moving):
     graph = LaneGraph.of([lane("own", 0.0, end=200.0, left="fast"), lane("fast", 3.5, right="own")])
     world = after(driven(graph, {"car": {}}, car=moving(0, 0, z=0.8, speed=10.0)), 25.0)
     (x, y, _), _ = seen(world, "car")
@@ -241,13 +241,13 @@ def test_a_lane_that_ends_is_left_for_the_one_that_goes_on(driven, moving):
 # --- beginning ----------------------------------------------------------------------------------
 
 
-def test_without_a_map_it_is_refused(driven, moving):
+def test_lane_drivers_need_a_map(driven, moving):
     with pytest.raises(WorldError, match="has no map") as caught:
         driven(None, {"car": {}}, car=moving(0, 0, speed=5.0))
     assert caught.value.code == ErrorCode.INVALID_REQUEST
 
 
-def test_who_is_in_no_lane_keeps_to_its_recorded_path(driven, moving):
+def test_cars_outside_lanes_follow_their_recorded_path(driven, moving):
     cars = {"car": moving(0, -12, z=0.8, speed=5.0), "cross": moving(9, 0, speed=5.0, yaw=1.5)}
     world = after(driven(TWO, {"car": {"headway": 2.5}, "cross": {}}, **cars), 1.0)
     assert isinstance(world.traffic.drivers["car"], Idm)
@@ -255,13 +255,13 @@ def test_who_is_in_no_lane_keeps_to_its_recorded_path(driven, moving):
     assert world.traffic.drivers["car"].spec.headway == 2.5
 
 
-def test_everybody_drives_on_lanes_by_default(make_world, moving):
+def test_the_default_lane_driver_applies_to_cars_on_lanes(make_world, moving):
     made = make_world(moving(0, -40), car=moving(0, 0.4, z=0.8, speed=8.0), parked=moving(50, -6))
     agents = {"default": "lanes"}
     world = World(replace(made.scene, lanes=TWO), made.state, ResetSpec(agents=agents))
     assert isinstance(world.traffic.drivers["car"], LaneChanger)
     assert list(world.traffic.drivers) == ["car"]
-    # It comes back to the middle from where it began.
+    # It returns to the lane centre.
     for _ in range(80):
         world.step()
     assert abs(seen(world, "car")[0][1]) < 0.02

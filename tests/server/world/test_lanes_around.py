@@ -1,4 +1,4 @@
-"""Lanes in privileged observations: those near the vehicle, and no more than a message may hold."""
+"""Lanes near the vehicle in privileged observations, limited to the size of a message."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ STREET = LaneGraph.of(
 )
 
 
-def test_places_lie_on_the_lane_within_reach_and_the_nearest_lane_comes_first():
+def test_lanes_are_sampled_within_the_radius_nearest_first():
     found = lanes_around(STREET, 20.0, 1.0)
     assert [piece.lane.lane_id for piece in found] == ["own", "left"]
     x, y, heading, width = found[1].places.T
@@ -42,12 +42,12 @@ def test_places_lie_on_the_lane_within_reach_and_the_nearest_lane_comes_first():
     assert np.diff(x).max() <= 5.0 + 1e-9
 
 
-def test_nobody_near_sees_none():
+def test_no_lanes_are_returned_out_of_reach():
     assert lanes_around(STREET, 0.0, 300.0) == ()
     assert lanes_around(LaneGraph({}), 0.0, 0.0) == ()
 
 
-def test_what_is_shown_is_bounded_however_dense_a_map_is():
+def test_the_result_is_bounded_on_dense_maps():
     rng = np.random.default_rng(0)
     turns = np.linspace(0, 40 * np.pi, 900)
     spiral = lane("spiral", np.column_stack([30 * np.cos(turns), 30 * np.sin(turns)]))
@@ -63,7 +63,7 @@ def test_what_is_shown_is_bounded_however_dense_a_map_is():
     assert nearest == sorted(nearest)
 
 
-def test_a_lane_that_comes_back_is_shown_where_it_is_nearest():
+def test_a_returning_lane_is_sampled_at_its_nearest_part():
     there = [(-300, 0), (300, 0), (300, 40), (-300, 40)]
     [piece] = lanes_around(LaneGraph.of([lane("u", there)]), 0.0, 5.0)
     np.testing.assert_array_equal(piece.places[:, 1], 0.0)
@@ -86,7 +86,7 @@ def test_only_privileged_observations_on_a_map_hold_lanes(observe):
     assert len(observe(STREET, privileged=True).lanes) == 2
 
 
-def test_they_come_to_the_planner_as_they_are(observe):
+def test_lanes_survive_the_round_trip_to_the_planner(observe):
     fields = observe(STREET, privileged=True).obs_fields()
     sent = decode(encode(Obs(**fields, frames=[]).model_dump()))
     seen = observation_from_wire(Obs.model_validate(sent))

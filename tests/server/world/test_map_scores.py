@@ -1,4 +1,4 @@
-"""Scores on a scene with a map: its surface, lanes, directions and limits, and that they say so."""
+"""Scores on a scene with a map: drivable area, lanes, directions and speed limits."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ ON_MAP = context(40, road_map=RoadMap(street()))
 WAY = [10.0] * 41
 
 
-def test_the_drivable_area_is_that_of_the_map():
-    instants = drive(WAY, y=-1.2)  # inside the corridor of the log, over the rim of the lane
+def test_the_drivable_area_comes_from_the_map():
+    instants = drive(WAY, y=-1.2)  # inside the corridor of the log, beyond the lane edge
     assert scores(instants, context(40))["pdms"].terms["DAC"] == 1.0
     found = scores(instants, ON_MAP)
     assert found["pdms"].terms["DAC"] == 0.0
     assert ON_MAP.off_road(instants[5].ego)[0] == pytest.approx(1.2 + 0.925 - 1.75)
 
 
-def test_oncoming_lanes_are_against_the_direction_of_driving():
+def test_driving_in_an_oncoming_lane_violates_the_direction():
     instants = drive(WAY, y=3.5)
     assert scores(instants, context(40, corridor=9.0))["nuplan_cls"].terms["DDC"] == 1.0
     found = scores(instants, ON_MAP)
@@ -50,13 +50,13 @@ def test_oncoming_lanes_are_against_the_direction_of_driving():
     assert found["carla_ds"].terms["in_lanes"] == 0.0
 
 
-def test_limits_of_lanes_count_where_the_request_gives_none():
+def test_lane_speed_limits_apply_without_a_requested_limit():
     assert scores(drive(WAY), ON_MAP)["nuplan_cls"].terms["SL"] == pytest.approx(1 - 2 / 2.23)
     slow = replace(ON_MAP, speed_limit=20.0)
     assert scores(drive(WAY), slow)["nuplan_cls"].terms["SL"] == 1.0
 
 
-def test_scores_say_that_they_use_the_map_and_keep_their_versions():
+def test_scores_name_their_map_and_keep_their_versions():
     light = Signal("l", "traffic_light", (50.0, 3.0, 4.0), lanes=("own",))
     with_light = replace(ON_MAP, road_map=RoadMap(street(signals=[light])))
     plain, mapped = scores(drive(WAY), context(40)), scores(drive(WAY), with_light)
@@ -66,13 +66,13 @@ def test_scores_say_that_they_use_the_map_and_keep_their_versions():
         assert plain[name].version == mapped[name].version
 
 
-def test_a_recording_keeps_the_map_of_its_scores_and_tells_of_none_without():
+def test_scoring_contexts_round_trip_with_and_without_a_map():
     assert "road_map" not in context(40).fields()
     again = ScoringContext.from_fields(ON_MAP.fields())
     before, after = (scores(drive(WAY, y=0.3), c) for c in (ON_MAP, again))
     assert {k: v.value for k, v in before.items()} == {k: v.value for k, v in after.items()}
 
 
-def test_lanes_made_of_the_log_leave_scores_as_they_are():
+def test_lanes_derived_from_the_log_are_not_used_for_scores():
     assert RoadMap.of(replace(street(), source="log")) is None
     assert RoadMap.of(None) is None

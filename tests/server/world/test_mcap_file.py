@@ -1,4 +1,4 @@
-"""Episodes as MCAP: what any reader sees, and the recording out of it again."""
+"""Episodes as MCAP files: Foxglove messages and the embedded recording."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def recording(make_scene, moving):
 
 @pytest.fixture(scope="module")
 def messages(recording, tmp_path_factory):
-    """Messages by topic, as a reader that knows nothing of us finds them."""
+    """Messages by topic, read with a generic MCAP reader."""
     path = save_mcap(recording, tmp_path_factory.mktemp("mcap") / "a" / "episode.mcap")
     found: dict[str, list] = {}
     with path.open("rb") as file:
@@ -68,7 +68,7 @@ def messages(recording, tmp_path_factory):
     return found
 
 
-def test_point_clouds_are_those_that_viewers_know(messages):
+def test_point_clouds_are_foxglove_messages(messages):
     [(schema, at, cloud)] = messages["/lidar/top"]
     assert (schema, at) == ("foxglove.PointCloud", 5_300_000_000)
     assert cloud["frame_id"] == "world"
@@ -85,18 +85,18 @@ def test_point_clouds_are_those_that_viewers_know(messages):
     assert np.frombuffer(data[18:30], "<f4").tolist() == [4.0, 5.0, 6.0]
 
 
-def test_a_broken_cloud_is_refused_by_its_name(recording):
+def test_a_broken_cloud_is_named(recording):
     broken = replace(recording, frames={"frames/top/lidar/000003.cloud": b"nothing"})
     with pytest.raises(RecordingError, match="top/lidar/3 is no point cloud"):
         mcap_bytes(broken)
 
 
-def test_the_recording_comes_back_whole(recording, tmp_path):
+def test_the_recording_round_trips(recording, tmp_path):
     path = save_mcap(recording, tmp_path / "episode.mcap")
     assert to_bytes(recording_in(path)) == to_bytes(recording)
 
 
-def test_the_same_episode_is_the_same_file(recording):
+def test_equal_episodes_give_equal_files(recording):
     assert mcap_bytes(recording) == mcap_bytes(recording)
 
 
@@ -117,7 +117,7 @@ def test_every_instant_has_the_pose_of_the_vehicle(recording, messages):
         assert yaw == pytest.approx(instant.ego.yaw, abs=1e-12)
 
 
-def test_objects_are_boxes_where_they_were(recording, messages):
+def test_objects_are_boxes_at_their_positions(recording, messages):
     last, (schema, _, body) = recording.instants[-1], messages["/scene"][-1]
     assert schema == "foxglove.SceneUpdate"
     entities = {e["id"]: e for e in body["entities"]}
@@ -128,7 +128,7 @@ def test_objects_are_boxes_where_they_were(recording, messages):
     assert list(cube["size"].values()) == last.others.sizes[row].tolist()
 
 
-def test_plans_contacts_scores_and_images_are_there(recording, messages):
+def test_plans_contacts_metrics_and_images_are_exported(recording, messages):
     assert len(messages["/plan"]) == 12
     assert len(messages["/plan"][0][2]["poses"]) == 10
     contacts = [c[2]["object_id"] for c in messages["/contact"]]
@@ -140,7 +140,7 @@ def test_plans_contacts_scores_and_images_are_there(recording, messages):
     assert log_time == recording.instants[2].t_us * 1000
 
 
-def test_episodes_without_plans_have_no_topic_for_them(make_scene):
+def test_episodes_without_plans_have_no_plan_topic(make_scene):
     scene = make_scene()
     log = [Entry("reset", 0, reset_payload(ResetSpec(action="control")))]
     log.append(Entry("action", 0, action_payload(Control(acceleration=0.0, steering=0.0))))
@@ -149,7 +149,7 @@ def test_episodes_without_plans_have_no_topic_for_them(make_scene):
     assert b"/tf" in mcap_bytes(made)
 
 
-def test_files_without_an_episode_are_refused(tmp_path):
+def test_files_that_are_not_mcap_are_refused(tmp_path):
     path = tmp_path / "other.mcap"
     path.write_bytes(b"not mcap at all, but long enough to be looked at")
     with pytest.raises(RecordingError, match="not an MCAP file"):

@@ -31,7 +31,7 @@ def drive_for(motion: Motion, seconds: float, *, dt_us: int = 100_000, **command
 
 
 @pytest.mark.parametrize("steering", [0.3, -0.1, 0.001])
-def test_constant_steering_drives_the_circle_of_the_bicycle(steering):
+def test_constant_steering_drives_the_bicycle_circle(steering):
     radius = SPEC.wheelbase / math.tan(steering)
     start = Motion(0.0, 0.0, 0.0, speed=7.0, steering=steering)
     motion = start
@@ -57,7 +57,7 @@ def test_braking_never_reverses():
     assert drive_for(stopped, 1, acceleration=-8.0).x == stopped.x
 
 
-def test_acceleration_covers_half_a_t_squared():
+def test_distance_under_acceleration_is_half_a_t_squared():
     motion = drive_for(Motion(0.0, 0.0, 0.0), 3, acceleration=2.0)
 
     assert motion.speed == pytest.approx(6.0)
@@ -65,7 +65,7 @@ def test_acceleration_covers_half_a_t_squared():
     assert motion.acceleration == pytest.approx(2.0)
 
 
-def test_limits_of_acceleration_braking_and_speed_hold():
+def test_acceleration_braking_and_speed_are_limited():
     start = Motion(0.0, 0.0, 0.0, speed=59.0)
 
     assert drive_for(start, 1, acceleration=100).speed == SPEC.max_speed
@@ -74,7 +74,7 @@ def test_limits_of_acceleration_braking_and_speed_hold():
     assert drive_for(slow, 1, acceleration=100).speed == pytest.approx(SPEC.max_acceleration)
 
 
-def test_steering_moves_at_its_rate_up_to_its_limit():
+def test_steering_rate_and_angle_are_limited():
     motion = Motion(0.0, 0.0, 0.0, speed=5.0)
 
     assert drive_for(motion, 0.5, steering=1.5).steering == pytest.approx(0.4)
@@ -88,7 +88,7 @@ def test_steering_moves_at_its_rate_up_to_its_limit():
     steering=st.floats(-0.7, 0.7),
     yaw=st.floats(-4, 4),
 )
-def test_the_step_length_hardly_matters(speed, acceleration, steering, yaw):
+def test_motion_hardly_depends_on_the_time_step(speed, acceleration, steering, yaw):
     start = Motion(3.0, -2.0, yaw, speed=speed)
     command = {"acceleration": acceleration, "steering": steering}
     coarse = drive_for(start, 1, dt_us=100_000, **command)
@@ -99,7 +99,7 @@ def test_the_step_length_hardly_matters(speed, acceleration, steering, yaw):
 
 
 @given(x=st.floats(-50, 50), y=st.floats(-50, 50), turn=st.floats(-3, 3))
-def test_motion_does_not_depend_on_where_and_which_way(x, y, turn):
+def test_motion_is_invariant_to_the_initial_pose(x, y, turn):
     command = {"acceleration": 1.0, "steering": 0.2}
     here = drive_for(Motion(0.0, 0.0, 0.0, speed=6.0), 1, **command)
     there = drive_for(Motion(x, y, turn, speed=6.0), 1, **command)
@@ -110,7 +110,7 @@ def test_motion_does_not_depend_on_where_and_which_way(x, y, turn):
     assert there.yaw == pytest.approx(turn + here.yaw)
 
 
-def test_a_placed_vehicle_has_the_velocities_of_its_way():
+def test_a_teleported_vehicle_has_the_velocities_of_its_displacement():
     radius, turn = 20.0, 0.05
     start = Motion(0.0, 0.0, 0.0, speed=5.0)
     pose = (radius * math.sin(turn), radius * (1 - math.cos(turn)), turn + math.tau)
@@ -123,7 +123,7 @@ def test_a_placed_vehicle_has_the_velocities_of_its_way():
     assert motion.yaw == pytest.approx(turn)
 
 
-def test_the_recorded_motion_has_the_logs_speed_and_turn(make_scene):
+def test_logged_motion_has_the_speed_and_steering_of_the_log(make_scene):
     ego = make_scene().ego
     motion = logged_motion(ego, ego.start_us + 150_000, SPEC)
 

@@ -1,4 +1,4 @@
-"""The loop's contact with the background and the colliders of simulations see the same cells."""
+"""Episodes and simulations use the same occupied background cells."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def cloud(points) -> GaussianCloud:
     ],
     ids=["driven", "standing"],
 )
-def test_the_recorded_way_clears_what_the_loop_clears(ego):
+def test_both_path_types_clear_the_same_cells(ego):
     around = np.random.default_rng(0).uniform((-5, -5, 0.5), (15, 8, 1.5), (20_000, 3))
     cells = [
         occupied_cells(cloud(around), Ground.level(0.0), way)
@@ -45,7 +45,7 @@ def test_the_recorded_way_clears_what_the_loop_clears(ego):
     assert cells[0].occupied.any()
 
 
-def test_haze_floaters_road_and_canopies_are_in_nobodys_way():
+def test_haze_floaters_road_and_canopies_are_not_obstacles():
     spread = np.array([[0.0, 0, 0], [0.05, 0, 0], [0, 0.05, 0]])
     solid, road, canopy, haze = (
         spread + place for place in ((12.0, 6.0, 1.0), (20.0, 6.0, 0.1), (8, 9, 3), (25, 6, 1))

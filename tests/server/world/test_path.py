@@ -36,7 +36,7 @@ def slope(*, pitch: float, roll: float) -> Trajectory:
 
 @settings(deadline=None)
 @given(s=st.floats(0.5, 28), offset=st.floats(-8, 8))
-def test_nearest_finds_distance_and_side(s, offset):
+def test_nearest_returns_arc_length_and_signed_offset(s, offset):
     path = LoggedPath(circle(20.0, 1.5))
     angle = s / 20
     x, y = (20 - offset) * math.sin(angle), 20 - (20 - offset) * math.cos(angle)
@@ -48,7 +48,7 @@ def test_nearest_finds_distance_and_side(s, offset):
 
 
 @pytest.mark.parametrize("x", [-30.0, 45.0])
-def test_beyond_its_ends_a_path_goes_straight_on_to_either_side(x):
+def test_a_path_extends_straight_beyond_its_ends(x):
     path = LoggedPath(along([(k, 0.0, 0.0) for k in range(21)], yaw_quaternion(np.zeros(21))))
     near = path.nearest(x, 1.5)
     assert near.offset == pytest.approx(1.5)
@@ -66,7 +66,7 @@ def test_a_path_that_crosses_itself_is_followed_in_order():
     assert path.nearest(0.1, 0.0, near_s=2.0).s == pytest.approx(0, abs=1)
 
 
-def test_a_vehicle_put_elsewhere_is_found_again():
+def test_nearest_finds_a_vehicle_far_from_the_hint():
     path = LoggedPath(circle(100.0, 3.0))
 
     assert path.nearest(100.0, 100.0, near_s=0.0).s == pytest.approx(50 * np.pi, abs=0.1)
@@ -79,7 +79,7 @@ def test_a_vehicle_that_never_moved_has_a_path_along_its_heading():
     assert path.nearest(0.5, 2.5).offset == pytest.approx(0.5)
 
 
-def test_noise_of_a_standing_vehicle_adds_no_way():
+def test_noise_of_a_standing_vehicle_adds_no_length():
     noise = np.random.default_rng(0).normal(scale=0.005, size=(100, 3))
     path = LoggedPath(along(noise, np.tile([1.0, 0, 0, 0], (100, 1))))
 
@@ -98,7 +98,7 @@ def test_the_route_lies_on_the_recorded_path():
     np.testing.assert_allclose(route, expected, atol=0.02)
 
 
-def test_beyond_the_recording_the_route_goes_straight_on():
+def test_the_route_continues_straight_beyond_the_recording():
     path = LoggedPath(circle(30.0, np.pi / 2))
     route = route_ahead(path, path.length, 30.0, 30.0, np.pi / 2)
 
@@ -107,11 +107,11 @@ def test_beyond_the_recording_the_route_goes_straight_on():
 
 
 @pytest.mark.parametrize(("radius", "command"), [(20, "left"), (-20, "right"), (200, "straight")])
-def test_the_command_says_which_way_the_path_turns(radius, command):
+def test_the_command_matches_the_turn_of_the_path(radius, command):
     assert command_ahead(LoggedPath(circle(float(radius), 1.5)), 2.0) == command
 
 
-def test_headings_that_wrap_are_no_turn():
+def test_wrapped_headings_are_not_a_turn():
     yaw = np.pi - 0.05 + np.linspace(0, 0.1, 200)
     x = -np.arange(200.0)
     path = LoggedPath(along(np.stack([x, 0 * x, 0 * x], axis=1), yaw_quaternion(yaw)))
@@ -121,7 +121,7 @@ def test_headings_that_wrap_are_no_turn():
 
 @pytest.mark.parametrize("offset", [0.0, 0.7])
 @pytest.mark.parametrize("s", [-3.0, 0.0, 11.3, 60.0])
-def test_places_ahead_are_those_of_the_path_to_the_bit(s, offset):
+def test_the_strip_ahead_equals_the_path_exactly(s, offset):
     path = LoggedPath(circle(50, 1.5))
     found = strip_ahead(path.knots, s, offset)
     for i, (x, y, yaw) in enumerate(found.tolist()):

@@ -1,4 +1,4 @@
-"""What is worked out once for an object."""
+"""Values cached by object identity."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from real2sim_proto.episode import EgoSpec
 from real2sim_server.world.common import MAX_CACHED, cache_by_identity
 
 
-def test_an_object_is_asked_about_once_and_another_of_its_own() -> None:
+def test_a_function_is_called_once_per_object() -> None:
     asked: list[float] = []
 
     @cache_by_identity
@@ -19,7 +19,7 @@ def test_an_object_is_asked_about_once_and_another_of_its_own() -> None:
     assert asked == [2.5, 3.5]
 
 
-def test_objects_that_are_gone_are_nobody_elses() -> None:
+def test_new_objects_do_not_get_values_of_deleted_ones() -> None:
     @cache_by_identity
     def first(values: list[int]) -> int:
         return values[0]

@@ -1,4 +1,4 @@
-"""Impacts that take time: pulses of the closed loop, their sum, their crush, and the matter."""
+"""Impact pulses of the closed loop: impulse, crush and comparison with the particle solver."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ CAR = BodyProperties(
 )
 H = 0.01
 SECONDS = 0.4
-"""After so long closed loop and matter are compared: cars that turn may meet once more later on."""
+"""Time of the comparison with the particle solver [s]. Turning cars may collide again later."""
 
 
 def rear_end(make_world, moving, **contact):
@@ -50,7 +50,7 @@ def rear_end(make_world, moving, **contact):
 
 
 def speeds(world, steps: int = 30) -> np.ndarray:
-    """Of the ego from just before the contact on."""
+    """Speeds of the ego from just before the contact [m/s]."""
     found = [world.motion.speed]
     while not world.impacts:
         world.step(COAST)
@@ -64,7 +64,7 @@ def speeds(world, steps: int = 30) -> np.ndarray:
 # --- in the world -----------------------------------------------------------------------------
 
 
-def test_an_impact_takes_time_and_exchanges_what_a_sudden_one_does(make_world, moving):
+def test_a_pulse_takes_time_and_exchanges_the_same_impulse(make_world, moving):
     lasting = speeds(rear_end(make_world, moving))
     sudden = speeds(rear_end(make_world, moving, pulse=False))
     assert lasting[-1] == pytest.approx(sudden[-1], abs=0.15)
@@ -75,7 +75,7 @@ def test_an_impact_takes_time_and_exchanges_what_a_sudden_one_does(make_world, m
     assert -np.diff(sudden).min() / 0.02 / 9.81 > 25
 
 
-def test_what_was_crushed_stays_shorter(make_world, moving):
+def test_residual_crush_shortens_both_cars(make_world, moving):
     world = rear_end(make_world, moving)
     speeds(world, steps=120)
     front, rear = world._contacts.ego_crush
@@ -86,7 +86,7 @@ def test_what_was_crushed_stays_shorter(make_world, moving):
     assert struck.box_ahead > 0.0
 
 
-def test_a_fork_amid_an_impact_goes_on_as_the_world_does(make_world, moving):
+def test_a_fork_during_an_impact_continues_identically(make_world, moving):
     world = rear_end(make_world, moving)
     speeds(world, steps=2)
     fork = world.fork()
@@ -96,7 +96,7 @@ def test_a_fork_amid_an_impact_goes_on_as_the_world_does(make_world, moving):
     assert fork.motion == world.motion
 
 
-def test_specs_of_older_logs_keep_their_sudden_impacts(make_world, moving):
+def test_older_logs_keep_instantaneous_impacts(make_world, moving):
     spec = rear_end(make_world, moving).spec
     fields = spec.model_dump(mode="json")
     for name in ("pulse", "residual_crush", "distributed", "progressive", "breakage"):
@@ -111,7 +111,7 @@ def test_specs_of_older_logs_keep_their_sudden_impacts(make_world, moving):
     assert recorded.residual_crush
 
 
-def test_a_struck_person_weighs_by_height_and_in_older_logs_as_before(make_scene, moving):
+def test_pedestrian_mass_depends_on_height_except_in_older_logs(make_scene, moving):
     scene = make_scene(None, walker=moving(20, 0, z=0.8))
     objects = {"walker": replace(scene.objects["walker"], category="pedestrian")}
     scene = replace(scene, objects=objects)
@@ -129,7 +129,7 @@ def test_a_struck_person_weighs_by_height_and_in_older_logs_as_before(make_scene
     )
 
 
-def test_a_struck_car_turns_by_the_inertia_of_its_class(make_world, moving):
+def test_a_struck_car_has_the_yaw_inertia_of_its_class(make_world, moving):
     turns = []
     for residual_crush in (True, False):
         world = rear_end(make_world, moving, residual_crush=residual_crush)
@@ -144,7 +144,7 @@ def test_a_struck_car_turns_by_the_inertia_of_its_class(make_world, moving):
 # --- one pair ---------------------------------------------------------------------------------
 
 
-def test_crush_is_that_of_who_meets():
+def test_mutual_stiffness_and_contact_width_depend_on_both_bodies():
     car = (BodyState(0, 0, 0, 10, 0, 0), CAR)
     other = (BodyState(LENGTH, 0, 0, 0, 0, 0), CAR)
     person = (
@@ -155,12 +155,12 @@ def test_crush_is_that_of_who_meets():
     assert mutual_stiffness((car, None), -1, 0) == front
     assert 0.4 * front < mutual_stiffness((car, other), -1, 0) < 0.6 * front
     assert mutual_stiffness((car, person), -1, 0) < 0.2 * front
-    # A pole takes along what is beside it, a wall no more than the face that it meets.
+    # A pole also deforms the structure beside it; a wall at most the width of the face.
     assert contact_width((car, None), 0.25, -1, 0) == pytest.approx(0.75)
     assert contact_width((car, None), 4.0, -1, 0) == WIDTH
 
 
-def test_a_pole_is_narrow_and_a_wall_is_broad():
+def test_a_pole_is_narrow_and_a_wall_is_wide():
     occupied = np.zeros((40, 40), dtype=bool)
     occupied[20, 10] = True
     occupied[30, :] = True
@@ -175,14 +175,14 @@ def test_a_pole_is_narrow_and_a_wall_is_broad():
 
 
 @pytest.mark.parametrize("restitution", [0.0, 0.1, 0.5, 1.0])
-def test_a_central_pulse_gives_back_its_restitution(restitution):
+def test_a_central_pulse_reproduces_its_restitution(restitution):
     first, second = collided(SQUARE["rear end"], restitution=restitution)[0]
     assert second.vx == pytest.approx(10 * (1 + restitution) / 2, rel=1e-6)
     assert first.vx + second.vx == pytest.approx(10.0)
 
 
-def test_an_edge_is_pushed_back_from_further_inside():
-    """A car's front against a wall that covers all of it, its middle, or one edge of it."""
+def test_the_force_on_an_edge_acts_further_inside():
+    """A car's front against a wall that covers all of it, its middle or one edge."""
     front = corners(BodyState(-LENGTH / 2 + 0.1, 0, 0, 0, 0, 0), CAR)
 
     def place(low: float, high: float) -> float:
@@ -194,22 +194,22 @@ def test_an_edge_is_pushed_back_from_further_inside():
 
     assert place(-2.0, 2.0) == pytest.approx(0.0)
     assert place(-0.2, 0.2) == pytest.approx(0.0)
-    # The wall ends, too, so that neither yields beyond its edge.
+    # The wall also ends here, so neither side yields beyond its edge.
     assert place(0.0, 2.0) == pytest.approx(WIDTH / 4)
 
 
-def test_a_corner_in_a_face_is_pushed_back_from_further_inside():
+def test_the_force_of_a_corner_in_a_face_acts_further_inside():
     front = corners(BodyState(-LENGTH / 2 + 0.3, 0, 0, 0, 0, 0), CAR)
     corner = [(0.0, 0.6), (2.0, -1.4), (4.0, 0.6), (2.0, 2.6)]
     patch = yielding_patch(front, corner, -1.0, 0.0)
     assert patch is not None
-    # The corner reaches in from 0.3 to 0.9 m off the middle, next to the edge.
+    # The corner overlaps from 0.3 to 0.9 m off the centre line, near the edge.
     inward = (SPREAD / 2 - (WIDTH / 2 - 0.9)) / 2
     assert patch.y == pytest.approx(0.6 - inward)
 
 
-def test_force_stays_where_two_still_come_nearer():
-    """A car that turns: one half of its front runs into the other's rear, one half leaves it."""
+def test_force_acts_only_where_bodies_approach():
+    """Half of a turning car's front approaches the other's rear; the other half separates."""
     turning = (BodyState(-LENGTH / 2 + 0.2, 0, 0, 1, 0, 3), CAR)
     struck = (BodyState(LENGTH / 2, 0, 0, 0, 0, 0), CAR)
     contact = face_contact(corners(*turning), corners(*struck), -1.0, 0.0)
@@ -218,12 +218,12 @@ def test_force_stays_where_two_still_come_nearer():
     _, (push, *_) = advance_face_pulse(
         (turning, struck), Pulse(math.pi, 0.1), contact, H, friction=0.0
     )
-    # Approaching is what lies to the right of a third of a metre to the left of the middle.
+    # Everything to the right of y = 1/3 m approaches.
     assert push.y == pytest.approx((1 / 3 - WIDTH / 2) / 2, abs=WIDTH / 16)
     assert push.impulse.jx < 0
 
 
-def test_a_normal_turns_with_the_body_whose_face_was_struck():
+def test_the_normal_turns_with_the_struck_face():
     front, corner = (BodyState(0, 0, 0.2, 5, 0, 0), CAR), (BodyState(4, 1, 1.0, 0, 0, 0), CAR)
     towards = -math.cos(0.2), -math.sin(0.2)
     assert face_owner((front, corner), *towards) == 0
@@ -233,15 +233,15 @@ def test_a_normal_turns_with_the_body_whose_face_was_struck():
     assert pulse.along((front, corner)) == pytest.approx(towards)
 
 
-def test_what_has_been_crushed_pushes_no_more():
-    """Boxes still overlap when an impact is over, and turn in one another."""
+def test_crushed_bodies_push_no_more_after_the_impact():
+    """Boxes still overlap and turn after the impact."""
     pair = OFFSET["T-bone, front"]
     early, late = (collided(pair, restitution=0.5, seconds=t)[0] for t in (0.32, 0.6))
     for before, after in zip(early, late, strict=True):
         assert after[3:] == pytest.approx(before[3:])
 
 
-# --- against the matter -----------------------------------------------------------------------
+# --- against the particle solver --------------------------------------------------------------
 
 Start = tuple[float, float, float, float]
 """x, y [m], yaw [rad], speed along x [m/s]."""
@@ -275,21 +275,21 @@ OFFSET: dict[str, tuple[Start, Start]] = {
     "T-bone, rear": (_at(12), (WIDTH / 2, 1.2, ACROSS, 0)),
 }
 DELTA_V, YAW, SPAN = 0.1, 0.2, 0.2
-"""By how much the two may differ in velocity, in yaw rate and in duration."""
+"""Relative tolerances of velocity, yaw rate and duration."""
 YAW_LEAST = math.radians(4)
-"""Yaw rates this near to each other are alike, however small [rad/s]."""
+"""Absolute tolerance of the yaw rate [rad/s]."""
 PLACES = ((0.0, 0.0), (0.05, 0.1))
-"""Where pairs stand between the nodes of the grid [m]. The two cars of one symmetric impact turn by
-20.5 to 24.9 degrees a second, as that changes; the mean of both places is compared."""
+"""Offsets of the pairs from the grid nodes [m]. The yaw rate of a symmetric impact varies with them
+from 20.5 to 24.9 degrees/s, so the test compares the mean."""
 FINE = 0.1
-"""Spacing of the matter's particles [m]. At half as many again two ends run 0.3 m into one another
-before contact stops them, and yaw rates of oblique pairs are smaller by a third."""
+"""Spacing of the particles [m]. At 1.5 times this spacing two cars overlap by 0.3 m before contact
+stops them, and oblique pairs have a third less yaw rate."""
 
 
 def collided(
     pair, *, restitution: float = 0.1, seconds: float = SECONDS
 ) -> tuple[list[BodyState], Pulse]:
-    """Two free cars after their pulse."""
+    """Two free cars and their pulse after the impact."""
     *_, (bodies, pulse) = course(pair, restitution=restitution, seconds=seconds)
     assert pulse is not None
     return bodies, pulse
@@ -298,7 +298,7 @@ def collided(
 def course(
     pair, *, restitution: float = 0.1, seconds: float = SECONDS
 ) -> Iterator[tuple[list[BodyState], Pulse | None]]:
-    """Two free cars at the end of each H."""
+    """Two free cars and their pulse after each time step H."""
     bodies = [BodyState(x, y, yaw, v, 0.0, 0.0) for x, y, yaw, v in pair]
     pulse = None
     for _ in range(round(seconds / H)):
@@ -331,14 +331,14 @@ def course(
 
 
 def span(exchanged: list[float]) -> float:
-    """Time from 10 to 90 % of what has been exchanged until each H, of the largest [s]."""
+    """Rise time [s] from 10 to 90 % of the largest exchanged velocity, sampled every H."""
     grown = np.maximum.accumulate(exchanged)
     rises = [np.interp(part * grown[-1], grown, np.arange(len(grown))) for part in (0.1, 0.9)]
     return H * float(rises[1] - rises[0])
 
 
 def matter(pair, place: tuple[float, float]) -> tuple[list[tuple[float, float, float]], float]:
-    """Change of velocity, and yaw rate, of two cars of particles; how long they push."""
+    """Velocity change and yaw rate of two particle cars, and the duration of their impact [s]."""
     cars = [
         whole_car(
             name,
@@ -365,14 +365,14 @@ def matter(pair, place: tuple[float, float]) -> tuple[list[tuple[float, float, f
 
 
 def loop_span(pair) -> float:
-    """How long the two cars of a pulse push [s]."""
+    """Duration of the pulse between two cars [s]."""
     speed = pair[0][3]
     ways = (math.hypot(bodies[0].vx - speed, bodies[0].vy) for bodies, _ in course(pair))
     return span([0.0, *ways])
 
 
 def test_a_slow_impact_lasts_longer_than_a_fast_one():
-    """As that of the matter does: 99 ms at 10 m/s from behind, 66 ms at 30 m/s head on."""
+    """The particle solver takes 99 ms (rear end, 10 m/s) and 66 ms (head on, 30 m/s)."""
     slow, fast = (loop_span(SQUARE[name]) for name in ("rear end", "head on, 30 m/s"))
     assert slow == pytest.approx(0.099, rel=SPAN)
     assert fast == pytest.approx(0.066, rel=SPAN)
@@ -380,7 +380,7 @@ def test_a_slow_impact_lasts_longer_than_a_fast_one():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SQUARE | OFFSET)
-def test_the_closed_loop_does_what_the_matter_does(name):
+def test_the_closed_loop_matches_the_particle_solver(name):
     pair = (SQUARE | OFFSET)[name]
     bodies, _ = collided(pair)
     runs = [matter(pair, place) for place in PLACES]

@@ -1,4 +1,4 @@
-"""What the seed of an episode draws, and that it draws nothing where nothing is asked for."""
+"""Random draws of an episode by its seed."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ NOISE = {"estimate": {"position": 0.5, "heading": 0.02, "speed": 0.3}}
 
 @pytest.fixture
 def begun(make_world, moving):
-    """The world of a seed and a ``randomization``."""
+    """Make a world with a seed and a ``randomization``."""
 
     def make(seed: int, randomization: dict, *, spec: dict | None = None, **cars):
         fields = CONTROL | {"seed": seed, "randomization": randomization} | (spec or {})
@@ -47,7 +47,7 @@ def driven(world: World, steps: int = 20) -> list[str]:
 # --- draws ----------------------------------------------------------------------------------------
 
 
-def test_a_draw_depends_on_seed_name_and_counters_alone():
+def test_a_draw_depends_only_on_seed_name_and_counters():
     draws = Draws(7)
     first = draws.uniform("start", 3)
     draws.uniform("other", 4)
@@ -56,8 +56,8 @@ def test_a_draw_depends_on_seed_name_and_counters_alone():
     assert all(other != first for other in others)
 
 
-def test_draws_keep_their_values_over_versions():
-    # Recordings and sessions of earlier versions replay by these numbers.
+def test_draws_are_stable_across_versions():
+    # Recordings and sessions of earlier versions depend on these numbers.
     assert Draws(1).uniform("start.lateral", 0) == [0.9954353250238952]
 
 
@@ -70,11 +70,11 @@ def test_normal_draws_have_mean_0_and_deviation_1():
 # --- the default ----------------------------------------------------------------------------------
 
 
-def test_seeds_change_nothing_where_nothing_is_randomized(begun):
+def test_seeds_have_no_effect_without_randomization(begun):
     assert driven(begun(0, {})) == driven(begun(12345, {}))
 
 
-def test_an_episode_without_randomization_says_nothing_of_it(begun):
+def test_observations_without_randomization_have_no_extra_fields(begun):
     fields = begun(3, {}).observe().obs_fields()
     assert not {"drawn", "ego_truth", "lap"} & set(fields)
 
@@ -82,7 +82,7 @@ def test_an_episode_without_randomization_says_nothing_of_it(begun):
 # --- start ----------------------------------------------------------------------------------------
 
 
-def test_the_start_is_drawn_within_its_ranges_and_reported(begun):
+def test_a_random_start_is_within_its_ranges_and_reported(begun):
     for seed in range(20):
         world = begun(seed, START)
         motion, drawn = world.motion, world.observe().drawn
@@ -95,13 +95,13 @@ def test_the_start_is_drawn_within_its_ranges_and_reported(begun):
         assert abs(motion.yaw) <= 0.05
 
 
-def test_seeds_differ_and_the_same_seed_does_not(begun):
+def test_episodes_depend_only_on_the_seed(begun):
     assert driven(begun(1, START)) == driven(begun(1, START))
     assert driven(begun(1, START)) != driven(begun(2, START))
 
 
-def test_a_drawn_start_is_never_inside_another_car(begun, moving):
-    # A third of all starts that could be drawn would touch the car ahead.
+def test_a_drawn_start_never_overlaps_another_car(begun, moving):
+    # A third of all possible starts would touch the car ahead.
     car = moving(7.0, 0, z=0.8)
     ranges = {"start": {"longitudinal": 3.0}}
     for seed in range(20):
@@ -111,7 +111,7 @@ def test_a_drawn_start_is_never_inside_another_car(begun, moving):
         assert not world._contacts.ignored_pairs
 
 
-def test_what_is_drawn_is_in_the_first_observation_alone(begun):
+def test_drawn_values_are_only_in_the_first_observation(begun):
     world = begun(1, START)
     assert set(world.observe().drawn) == {f"start.{name}" for name in START["start"]}
     world.step(COAST)
@@ -119,7 +119,7 @@ def test_what_is_drawn_is_in_the_first_observation_alone(begun):
     assert set(world.sampled) == {f"start.{name}" for name in START["start"]}
 
 
-def test_a_start_is_not_drawn_for_a_warm_up(begun):
+def test_a_random_start_with_a_warm_up_is_refused(begun):
     with pytest.raises(WorldError, match="moves the start off it"):
         begun(1, START, spec={"warmup_us": 500_000})
 
@@ -137,7 +137,7 @@ def test_parameters_of_idm_are_drawn_for_each_object(begun, moving):
     assert drawn["agents.a.headway"] != drawn["agents.b.headway"]
 
 
-def test_what_is_drawn_for_an_object_does_not_depend_on_the_others(begun, moving):
+def test_draws_for_an_object_do_not_depend_on_others(begun, moving):
     a, b = moving(30, 0, z=0.8, speed=6.0), moving(60, 0, z=0.8, speed=6.0)
     spec, ranges = {"agents": {"default": "idm"}}, {"traffic": {"headway": 0.3}}
     alone = begun(4, ranges, spec=spec, b=b).sampled["agents.b.headway"]
@@ -159,13 +159,13 @@ def test_the_estimate_has_errors_and_the_truth_is_privileged(begun):
     assert np.std(errors) == pytest.approx(0.5, rel=0.25)
 
 
-def test_the_truth_is_kept_from_a_planner_without_privilege(begun):
+def test_the_truth_is_hidden_without_privilege(begun):
     fields = begun(1, NOISE, spec={"privileged": False}).observe().obs_fields()
     assert "ego_truth" not in fields
     assert fields["agents"] == []
 
 
-def test_the_estimate_moves_nothing(begun):
+def test_the_estimate_does_not_affect_the_motion(begun):
     exact, noisy = begun(1, {}), begun(1, NOISE)
     for _ in range(20):
         exact.step(COAST)
@@ -174,7 +174,7 @@ def test_the_estimate_moves_nothing(begun):
     assert noisy.metrics() == exact.metrics()
 
 
-def test_the_route_is_seen_from_the_estimate(begun):
+def test_the_route_is_relative_to_the_estimate(begun):
     world = begun(2, {"estimate": {"heading": 0.2}})
     estimate = world.observe()
     ahead = estimate.route[-1]
@@ -196,7 +196,7 @@ def test_correlated_errors_change_slowly(begun):
 # --- latency --------------------------------------------------------------------------------------
 
 
-def test_a_wait_is_added_to_the_latency_of_each_plan(begun):
+def test_latency_is_drawn_for_each_plan(begun):
     world, waits = begun(1, {"latency_us": 300_000}), []
     for _ in range(20):
         world.step(COAST)
@@ -205,7 +205,7 @@ def test_a_wait_is_added_to_the_latency_of_each_plan(begun):
     assert 200_000 < max(waits) <= 300_000
 
 
-def test_a_plan_takes_effect_after_the_drawn_wait(begun):
+def test_a_plan_takes_effect_after_the_drawn_latency(begun):
     at_once = {"actuators": {"drive_lag": 0.0, "steering_lag": 0.0}}
     world = begun(1, {"latency_us": 300_000}, spec={"ego": at_once})
     speeds, wait = [], None
@@ -223,14 +223,14 @@ ALL = START | NOISE | {"traffic": {"headway": 0.3}, "latency_us": 50_000}
 SPAWNING = {"agents": {"spawn": {"density": 60, "lanes": [{"offset": 3.5}]}}}
 
 
-def test_a_fork_goes_on_with_the_same_draws(begun, moving):
+def test_a_fork_continues_with_the_same_draws(begun, moving):
     world = begun(9, ALL, spec=SPAWNING, car=moving(30, 0, z=0.8, speed=6.0))
     driven(world, 5)
     fork = world.fork()
     assert driven(world) == driven(fork)
 
 
-def test_a_recording_holds_what_was_drawn_and_replays(make_scene, moving):
+def test_a_recording_holds_the_drawn_values_and_replays(make_scene, moving):
     scene = make_scene(car=moving(30, 0, z=0.8, speed=6.0))
     spec = ResetSpec(**CONTROL, seed=9, randomization=ALL, **SPAWNING)
     entries = [Entry("reset", 0, reset_payload(spec))]

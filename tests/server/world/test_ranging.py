@@ -1,4 +1,4 @@
-"""Sweeps and scans of a world in which everything moves."""
+"""LiDAR sweeps and radar scans of moving worlds."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ QUIET = {"clutter_rate": 0, "range_noise_m": 0, "azimuth_noise_deg": 0, "velocit
 
 
 def wall(x: float, *, half: float = 12.0) -> GaussianCloud:
-    """A wall across the road that faces back along x."""
+    """A wall across the road that faces -x."""
     y, z = (g.ravel() for g in np.meshgrid(np.arange(-half, half, 0.2), np.arange(-3, 6, 0.2)))
     n = len(y)
     parts = (
@@ -42,12 +42,12 @@ def wall(x: float, *, half: float = 12.0) -> GaussianCloud:
 
 @pytest.fixture(scope="module")
 def drive(make_scene, moving):
-    """Makes a world that drives at SPEED towards a wall, a car ahead of it; after some steps."""
+    """Make a world after some steps at SPEED towards a wall, behind a car."""
 
     def make(steps=2, *, background=None, car=None, **spec):
         scene = make_scene(moving(speed=SPEED), car=car or moving(20, 0, z=0.8, speed=8.0))
         background = background or wall(WALL_AT)
-        # The back of the car, a wall in its frame.
+        # The car's rear is a wall in the object frame.
         body = wall(-2.0, half=1.0)
         objects = {"car": replace(scene.objects["car"], cloud=body)}
         scene = replace(scene, background=background, objects=objects)
@@ -73,7 +73,7 @@ def world_points(found):
     return points @ pose[:3, :3].T + pose[:3, 3]
 
 
-def test_poses_between_instants_are_those_of_the_way(drive):
+def test_ego_poses_are_interpolated_between_instants(drive):
     world = drive(0, randomization={"start": {"heading": 0.3}}, seed=3)
     poses = [world.T_world_body]
     for _ in range(2):
@@ -88,13 +88,13 @@ def test_poses_between_instants_are_those_of_the_way(drive):
     np.testing.assert_allclose(found[1][:3, 3], middle, atol=1e-9)
 
 
-def test_the_wake_is_as_long_as_the_longest_sweep(drive):
+def test_the_motion_history_covers_the_longest_sweep(drive):
     world = drive(9)
     assert len(world.motion_history.segments) == 2
     assert world.motion_history.segments[-1].until_us == world.t_us
 
 
-def test_compensated_points_of_a_wall_lie_on_it_and_raw_ones_do_not(drive):
+def test_only_compensated_points_lie_on_the_wall(drive):
     world = drive()
     assert [mounted.name for mounted in world.due_ranging()] == ["top"]
     found = cloud(world)
@@ -103,11 +103,11 @@ def test_compensated_points_of_a_wall_lie_on_it_and_raw_ones_do_not(drive):
     assert np.abs(points[:, 0] - WALL_AT).max() < 2e-3
     raw = cloud(drive(lidars=[LIDAR | {"compensated": False}]))
     off = world_points(raw)[on_wall(raw), 0] - WALL_AT
-    # Ahead is looked at in the middle of a turn of 100 ms.
+    # The sensor faces ahead halfway through its 100 ms revolution.
     assert 0.4 < np.median(off) < 1.1
 
 
-def test_objects_are_met_where_they_were_when_the_ray_was_fired(drive):
+def test_objects_are_hit_at_the_firing_time_of_each_ray(drive):
     world = drive()
     found = cloud(world)
     own = ~on_wall(found)
@@ -117,7 +117,7 @@ def test_objects_are_met_where_they_were_when_the_ray_was_fired(drive):
     np.testing.assert_allclose(x, 18.0 + 8.0 * seconds, atol=5e-3)
 
 
-def test_before_the_first_step_all_goes_as_it_does_then(drive):
+def test_the_first_sweep_extrapolates_the_initial_motion(drive):
     world = drive(0)
     found = cloud(world)
     assert np.abs(world_points(found)[on_wall(found), 0] - WALL_AT).max() < 2e-3
@@ -126,7 +126,7 @@ def test_before_the_first_step_all_goes_as_it_does_then(drive):
     np.testing.assert_allclose(world_points(found)[own, 0], expected, atol=5e-3)
 
 
-def test_an_object_that_an_edit_has_moved_never_was_between(drive):
+def test_edited_objects_are_not_interpolated(drive):
     world = drive(2, car=None)
     world.apply([Translate(object_id="car", x=6.0)])
     found = cloud(world)
@@ -138,7 +138,7 @@ def test_an_object_that_an_edit_has_moved_never_was_between(drive):
     assert world_points(found)[~on_wall(found), 0].min() > 24.0
 
 
-def test_points_of_the_vehicle_frame_are_those_of_the_sensor_moved(drive):
+def test_vehicle_frame_points_are_offset_by_the_sensor_mount(drive):
     sensor = cloud(drive())
     vehicle = cloud(drive(lidars=[LIDAR | {"frame": "vehicle"}]))
     shift = vehicle.columns["points"] - sensor.columns["points"]
@@ -152,7 +152,7 @@ def test_a_higher_rate_shortens_the_sweep(drive):
     assert 49_000 < top.duration_us < 50_000
 
 
-def test_a_car_that_is_neared_has_the_relative_speed(drive):
+def test_radar_measures_the_relative_speed(drive):
     fine = {"azimuth_resolution_deg": 0.5, "elevation_resolution_deg": 1.0}
     radar = {"radar": "front", "model": QUIET | fine}
     scan = cloud(drive(lidars=[], radars=[radar]))
@@ -164,10 +164,10 @@ def test_a_car_that_is_neared_has_the_relative_speed(drive):
     np.testing.assert_allclose(nearing[~own], -SPEED, atol=0.05)
 
 
-def test_the_recorded_sweep_has_the_brightness_that_the_loop_shows(drive):
-    """Both know that these surfaces send less light back where they are met aslant."""
+def test_recorded_and_closed_loop_sweeps_have_the_same_intensity(drive):
+    """Both apply the lower intensity at oblique incidence."""
     world = drive(0)
-    cloud = wall(10.0, half=10.0)  # met at up to 45 degrees
+    cloud = wall(10.0, half=10.0)  # incidence up to 45 degrees
     mirror = Reflector(cloud, torch.tensor([[0.8, 0.0]]).repeat(len(cloud), 1))
     scene = replace(world.scene, lidar=LidarSurfaces(mirror, incidence=0.0), objects={})
     state = ScenarioState.of(scene)
@@ -179,7 +179,7 @@ def test_the_recorded_sweep_has_the_brightness_that_the_loop_shows(drive):
     assert np.allclose(shown, clouds_of(moving, [mounted], caster)[0].columns["intensity"])
 
 
-def test_periods_that_no_sweep_fits_into_are_refused(drive):
+def test_periods_shorter_than_a_sweep_are_refused(drive):
     with pytest.raises(WorldError, match="a sweep takes"):
         drive(0, lidars=[LIDAR | {"period_us": 50_000}])
     table = {"kind": "table", "azimuth_deg": [0, 1], "elevation_deg": [0, 0]}
@@ -188,7 +188,7 @@ def test_periods_that_no_sweep_fits_into_are_refused(drive):
         drive(0, lidars=[slow])
 
 
-def test_turned_objects_keep_their_turn_between_instants(drive, moving):
+def test_interpolated_objects_keep_their_yaw(drive, moving):
     world = drive(2, car=moving(20, 0, z=0.8, yaw=0.4))
     times = np.array([world.t_us - 30_000.0, world.t_us])
     found = world.motion_history.object_poses("car", times, t_us=world.t_us, now=world.agents)

@@ -1,4 +1,4 @@
-"""Episodes as files: read back, lived through again, scored again."""
+"""Episode recordings: round trips, replay and rescoring."""
 
 from __future__ import annotations
 
@@ -58,8 +58,8 @@ def plan_at(step: int) -> TrajectoryPlan:
 
 
 def entries(steps: int = 40, **spec) -> list[Entry]:
-    """An episode with everything in it: plans kept, missed and late, an edit, another client, a
-    crash, a return to a snapshot, an end by the clock on the wall."""
+    """An episode with all kinds of entries: plans on time, late and missed, an edit, an agent plan,
+    a snapshot and restore, and a wall-clock stop."""
     fields = {
         "on_collision": "continue",
         "agents": {"drivers": DRIVERS},
@@ -92,23 +92,23 @@ def recording(scene):
     return record(fresh(scene), entries(), scene_hash="abc", scenario=("sc_1", 3))
 
 
-def test_a_recording_holds_every_instant_that_was_not_undone(recording):
+def test_a_recording_omits_instants_undone_by_a_restore(recording):
     assert [i.step for i in recording.instants] == list(range(36))
     assert (recording.scenario_id, recording.scenario_revision) == ("sc_1", 3)
 
 
-def test_reading_back_gives_the_same(recording, tmp_path):
+def test_a_recording_round_trips(recording, tmp_path):
     path = save_recording(recording, tmp_path / "a" / "episode.r2e")
     again = load_recording(path)
     assert to_bytes(again) == to_bytes(recording)
     assert again.entries == recording.entries
 
 
-def test_living_through_it_again_gives_the_same_bits(recording, scene):
+def test_replay_reproduces_the_recording(recording, scene):
     assert first_difference(recording, fresh(scene)) is None
 
 
-def test_an_episode_of_a_scenario_is_lived_through_from_the_file_alone(scene, tmp_path):
+def test_a_scenario_episode_replays_from_the_file_alone(scene, tmp_path):
     moved = ScenarioState.of(scene)
     for operation in (Translate(object_id="other", x=3.0), Delete(object_id="parked")):
         moved = replay_operations(moved, [operation])
@@ -121,13 +121,13 @@ def test_an_episode_of_a_scenario_is_lived_through_from_the_file_alone(scene, tm
     assert first_difference(loaded, fresh(scene)) == 0
 
 
-def test_old_files_of_scenarios_say_that_they_can_only_be_scored(recording, scene):
+def test_scenario_recordings_without_state_cannot_be_replayed(recording, scene):
     assert recording.state is None
     with pytest.raises(RecordingError, match="'sc_1' at revision 3, which is not in the file"):
         recording.replayer(scene)
 
 
-def test_another_street_differs_from_the_first_step_on_that_shows_it(recording, make_scene, moving):
+def test_replay_on_another_scene_reports_the_first_difference(recording, make_scene, moving):
     other = make_scene(
         car=moving(40, 3.5, z=0.8, speed=5.0),
         other=moving(12, 0, z=0.8, speed=8.1),
@@ -136,19 +136,19 @@ def test_another_street_differs_from_the_first_step_on_that_shows_it(recording, 
     assert first_difference(recording, fresh(other)) == 0
 
 
-def test_scores_from_the_file_are_those_of_the_drive(recording, tmp_path):
+def test_rescoring_a_file_reproduces_its_scores(recording, tmp_path):
     loaded = load_recording(save_recording(recording, tmp_path / "episode.r2e"))
     assert [s.fields() for s in loaded.rescore()] == list(recording.scores)
     assert len({s["name"] for s in recording.scores}) == len(recording.scores) >= 9
 
 
-def test_the_same_episode_is_the_same_file(recording, scene):
+def test_equal_episodes_give_equal_files(recording, scene):
     again = record(fresh(scene), entries(), scene_hash="abc", scenario=("sc_1", 3))
     assert to_bytes(again) == to_bytes(recording)
 
 
 @pytest.mark.parametrize("content", [b"", b"not a zip", None])
-def test_files_that_are_no_recording_are_refused(tmp_path, content):
+def test_files_that_are_not_recordings_are_refused(tmp_path, content):
     path = tmp_path / "episode.r2e"
     if content is None:
         with zipfile.ZipFile(path, "w") as archive:
@@ -160,7 +160,7 @@ def test_files_that_are_no_recording_are_refused(tmp_path, content):
 
 
 def rewritten(path, recording, name, change):
-    """The recording as a file with one part changed by ``change``, in place."""
+    """Save the recording with ``change`` applied to one part."""
     parts = {}
     with zipfile.ZipFile(io.BytesIO(to_bytes(recording))) as archive:
         parts = {n: archive.read(n) for n in archive.namelist()}
@@ -206,13 +206,13 @@ def _row(key, value):
         ("context.msgpack", _put("lanes", [np.zeros((3, 1))])),
     ],
 )
-def test_damage_inside_is_told_by_name(recording, tmp_path, part, change):
+def test_damaged_parts_are_refused_with_the_file_name(recording, tmp_path, part, change):
     path = rewritten(tmp_path / "episode.r2e", recording, part, change)
     with pytest.raises(RecordingError, match=r"episode\.r2e"):
         load_recording(path)
 
 
-def test_damage_anywhere_in_the_file_is_told_by_name(recording, tmp_path):
+def test_bit_flips_raise_only_recording_errors(recording, tmp_path):
     whole = to_bytes(recording)
     path = tmp_path / "episode.r2e"
     generator = np.random.default_rng(3)
@@ -224,7 +224,7 @@ def test_damage_anywhere_in_the_file_is_told_by_name(recording, tmp_path):
             load_recording(path).rescore()
 
 
-def test_a_file_that_unpacks_to_more_than_is_allowed_is_refused(recording, tmp_path, monkeypatch):
+def test_a_file_that_unpacks_beyond_the_limit_is_refused(recording, tmp_path, monkeypatch):
     path = save_recording(recording, tmp_path / "episode.r2e")
     monkeypatch.setattr(recording_module, "MAX_BYTES", 1000)
     with pytest.raises(RecordingError, match="allowed are 1000"):
@@ -238,13 +238,13 @@ def test_an_entry_that_cannot_be_applied_is_named(recording, scene):
 
 
 def earlier_spec(**ego) -> dict:
-    """A spec as it was written before trackers knew of lags, in full."""
+    """A complete spec as stored before trackers compensated actuator lag."""
     fields = decode(reset_payload(ResetSpec(ego=ego)))["spec"]
     del fields["ego"]["actuators"]["foreseen"]
     return fields
 
 
-def test_an_old_log_keeps_its_actuators_and_trackers_that_do_not_know_them():
+def test_an_old_log_keeps_its_actuators_without_foresight():
     lagging = {"steering_lag": 0.1, "drive_lag": 0.0}
     spec = stored_spec(earlier_spec(actuators=lagging))
 
@@ -258,13 +258,13 @@ def test_a_log_without_actuators_has_ideal_ones(fields):
     )
 
 
-def test_a_log_of_today_means_what_it_says():
+def test_a_current_spec_round_trips():
     spec = ResetSpec(ego={"actuators": {"steering_lag": 0.3}})
 
     assert stored_spec(decode(reset_payload(spec))["spec"]) == spec
 
 
-def test_an_old_log_is_replayed_as_it_was_driven(scene):
+def test_an_old_log_replays_identically(scene):
     ideal = {"tracker": "ilqr", "actuators": {"steering_lag": 0.0, "drive_lag": 0.0}}
     resets = encode({"spec": earlier_spec(**ideal)}), reset_payload(ResetSpec(ego=ideal))
     logs = [[Entry("reset", 0, reset), *entries(10)[1:5]] for reset in resets]
@@ -275,13 +275,13 @@ def test_an_old_log_is_replayed_as_it_was_driven(scene):
     assert then.digests == now.digests
 
 
-def test_the_last_episode_begins_at_the_last_reset():
+def test_the_last_episode_starts_at_the_last_reset():
     log = entries(3)
     assert last_episode([*log, *log]) == log
     assert last_episode([]) == []
 
 
-def test_without_action_the_ego_hits_what_stands_in_its_lane(make_scene, moving):
+def test_no_action_impact_is_the_speed_into_a_parked_car(make_scene, moving):
     scene = make_scene(car=moving(60, 0, z=0.8))
     log = [Entry("reset", 0, reset_payload(ResetSpec(action="control")))]
     assert no_action_impact(fresh(scene), log) == pytest.approx(10.0, rel=0.01)
@@ -289,13 +289,13 @@ def test_without_action_the_ego_hits_what_stands_in_its_lane(make_scene, moving)
     assert no_action_impact(fresh(scene), log) == 0.0
 
 
-def test_a_log_cannot_begin_without_a_reset(scene):
+def test_a_log_starts_with_a_reset(scene):
     with pytest.raises(ValueError, match="a reset comes first"):
         fresh(scene).apply(Entry("action", 0, action_payload(None)))
 
 
 def as_written_before(recording):
-    """The file of an older version: without what the scores took from the reset later."""
+    """The recording as an older version wrote it, without later context fields."""
     parts = {}
     with zipfile.ZipFile(io.BytesIO(to_bytes(recording))) as archive:
         for name in archive.namelist():
@@ -312,7 +312,7 @@ def as_written_before(recording):
     return recording_module.recording_of_bytes(file.getvalue(), "old.r2e")
 
 
-def test_an_older_recording_is_scored_by_the_formulas_of_today(scene):
+def test_an_older_recording_is_rescored_with_current_formulas(scene):
     made = record(fresh(scene), entries(warmup_us=1_000_000), scene_hash="abc")
     old = as_written_before(made)
 
@@ -320,7 +320,7 @@ def test_an_older_recording_is_scored_by_the_formulas_of_today(scene):
     assert [s.fields() for s in old.rescore()] == list(made.scores)
 
 
-def test_an_older_recording_is_compared_by_motion_for_its_scores_were_others(scene, recording):
+def test_an_older_recording_is_compared_by_motion(scene, recording):
     old = as_written_before(recording)
     assert first_difference(old, fresh(scene)) is None
 

@@ -1,4 +1,4 @@
-"""Reverse gear: commands and plans that lead backwards."""
+"""Reverse gear: commands and plans that drive backwards."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from real2sim_server.world.plan import PlannedTrajectory
 from real2sim_server.world.replay import stored_spec
 
 BEHIND, ASIDE = 11.0, 2.5
-"""A gap beside the road, from where the vehicle has stopped [m]."""
+"""Parking gap relative to the stopped vehicle [m]."""
 
 Pose = tuple[float, float, float]
 
 
 def smooth(u: float) -> float:
-    """From 0 to 1 with no speed or acceleration at the ends."""
+    """A step from 0 to 1 with zero velocity and acceleration at both ends."""
     u = min(max(u, 0.0), 1.0)
     return u * u * u * (10 - 15 * u + 6 * u * u)
 
 
 def parking(t_us: int) -> Pose:
-    """Past the gap from 2 m/s to rest at second 2, a pause, and backwards into it."""
+    """Stop past the gap after 2 s from 2 m/s, wait 1 s, then reverse into it."""
     t = t_us * 1e-6
     way = 2 * t - t * t / 2 if t < 2 else 2.0
     back = BEHIND * smooth((t - 3) / 8)
@@ -46,7 +46,7 @@ def plan_of(t_us: int, poses: int = 30) -> TrajectoryPlan:
 
 
 def parked(make_scene, *, anew: bool = True, **ego) -> tuple[Motion, float]:
-    """The vehicle after it has parked, and its greatest distance from the plan on the way [m]."""
+    """The motion after parking, and the largest distance from the plan [m]."""
     controller = EgoController(ResetSpec(ego=ego), make_scene().ego)
     motion, worst = Motion(0.0, 0.0, 0.0, 2.0), 0.0
     for t_us in range(0, 12_000_000, 100_000):
@@ -61,7 +61,7 @@ def parked(make_scene, *, anew: bool = True, **ego) -> tuple[Motion, float]:
 
 @pytest.mark.parametrize("dynamics", ["kinematic_bicycle", "dynamic_bicycle"])
 @pytest.mark.parametrize("tracker", ["pursuit", "lqr", "ilqr", "perfect"])
-def test_a_plan_that_parks_backwards_is_followed(make_scene, tracker, dynamics):
+def test_a_reverse_parking_plan_is_followed(make_scene, tracker, dynamics):
     motion, worst = parked(make_scene, tracker=tracker, dynamics=dynamics)
 
     assert worst < 0.2
@@ -71,13 +71,13 @@ def test_a_plan_that_parks_backwards_is_followed(make_scene, tracker, dynamics):
 
 
 @pytest.mark.parametrize("tracker", ["pursuit", "lqr", "ilqr"])
-def test_one_plan_with_both_gears_is_followed_through_dead_times(make_scene, tracker):
+def test_a_plan_with_both_gears_is_followed_despite_dead_times(make_scene, tracker):
     delays = {"drive_delay_us": 100_000, "steering_delay_us": 100_000}
 
     assert parked(make_scene, anew=False, tracker=tracker, actuators=delays)[1] < 0.2
 
 
-def test_a_vehicle_without_the_gear_does_not_reverse(make_scene):
+def test_a_vehicle_without_reverse_gear_does_not_reverse(make_scene):
     motion, _ = parked(make_scene, tracker="pursuit", max_reverse_speed=0.0)
 
     assert motion.speed >= 0.0
@@ -92,20 +92,20 @@ def commanded(make_world, *commands: tuple[str, float, int], **ego) -> World:
     return world
 
 
-def test_a_command_drives_backwards_once_the_vehicle_stands(make_world):
+def test_a_reverse_command_takes_effect_at_standstill(make_world):
     rolling = commanded(make_world, ("reverse", 4.0, 20))
     assert rolling.motion.speed > 0
     world = commanded(make_world, ("reverse", 4.0, 50))
 
     assert -5.0 <= world.motion.speed < -1.0
-    # Wheels to the left take the tail to the left: the nose turns right.
+    # In reverse, steering left moves the rear to the left: the front turns right.
     assert world.motion.yaw_rate < 0
     ego = world.observe().ego_fields()
     assert (ego["gear"], ego["speed"]) == ("reverse", world.motion.speed)
     assert world.metrics()["feasible"] == 1.0
 
 
-def test_no_faster_than_the_gear_goes_and_brakes_to_a_stop(make_world):
+def test_reverse_speed_is_limited_and_braking_stops(make_world):
     fast = commanded(make_world, ("reverse", 4.0, 100), max_reverse_speed=3.0)
     stopped = commanded(make_world, ("reverse", 4.0, 50), ("reverse", -4.0, 40))
 
@@ -115,7 +115,7 @@ def test_no_faster_than_the_gear_goes_and_brakes_to_a_stop(make_world):
 
 
 @pytest.mark.parametrize("delay_us", [0, 200_000])
-def test_what_was_braking_when_the_gear_changed_does_not_drive(make_world, delay_us):
+def test_pending_braking_does_not_accelerate_in_reverse(make_world, delay_us):
     world = commanded(
         make_world,
         ("drive", -8.0, 30),
@@ -136,13 +136,13 @@ def test_a_command_without_a_gear_never_reverses(make_world):
     assert "gear" not in world.observe().ego_fields()
 
 
-def test_reverse_is_refused_by_a_vehicle_without_it(make_world):
+def test_reverse_commands_need_a_reverse_gear(make_world):
     with pytest.raises(WorldError, match="max_reverse_speed is 0") as refused:
         commanded(make_world, ("reverse", 1.0, 1), max_reverse_speed=0.0)
     assert refused.value.code == "INVALID_ACTION"
 
 
-def test_a_model_that_cannot_go_backwards_says_so(make_world, make_scene, monkeypatch):
+def test_a_model_without_reverse_refuses_the_command(make_world, make_scene, monkeypatch):
     forwards = VEHICLE_MODELS["kinematic_bicycle"]._replace(backwards=None)
     monkeypatch.setitem(VEHICLE_MODELS, "kinematic_bicycle", forwards)
 
@@ -151,7 +151,7 @@ def test_a_model_that_cannot_go_backwards_says_so(make_world, make_scene, monkey
     assert parked(make_scene)[0].speed >= 0.0
 
 
-def test_noise_of_a_plan_that_stands_does_not_change_gear(make_world, moving):
+def test_noise_of_a_standing_plan_does_not_change_gear(make_world, moving):
     world = make_world(moving(speed=0.0))
     random = np.random.default_rng(2)
     for _ in range(20):
@@ -163,7 +163,7 @@ def test_noise_of_a_plan_that_stands_does_not_change_gear(make_world, moving):
     assert abs(world.motion.x) < 0.1
 
 
-def test_the_length_of_the_step_does_not_matter(make_world):
+def test_reversing_does_not_depend_on_the_time_step(make_world):
     places = []
     for dt_us, steps in ((20_000, 250), (100_000, 50), (1_000_000, 5)):
         world = make_world(spec={"action": "control", "dt_us": dt_us})
@@ -175,7 +175,7 @@ def test_the_length_of_the_step_does_not_matter(make_world):
     assert places[2] == pytest.approx(places[1], abs=0.02)
 
 
-def test_worlds_in_batches_reverse_as_single_ones(make_scene, moving):
+def test_batched_worlds_reverse_like_single_worlds(make_scene, moving):
     scene, spec = make_scene(moving(speed=2.0)), ResetSpec(ego={"tracker": "lqr"})
     state = ScenarioState.of(scene)
     single, batch = World(scene, state, spec), BatchWorld(scene, spec, 2, state=state)
@@ -194,14 +194,14 @@ def test_worlds_in_batches_reverse_as_single_ones(make_scene, moving):
     assert not single.motion.reversing
 
 
-def test_egos_of_the_versions_before_have_no_reverse_gear():
+def test_egos_of_older_versions_have_no_reverse_gear():
     assert stored_spec({"ego": {}}).ego.max_reverse_speed == 0.0
     assert stored_spec({}).ego.max_reverse_speed == 0.0
     assert EgoSpec().max_reverse_speed == 5.0
 
 
 @pytest.mark.parametrize("turned", [0.0, 0.4, math.pi])
-def test_a_plan_leads_forwards_or_not_whichever_way_that_is_found(turned):
+def test_plan_direction_does_not_depend_on_its_construction(turned):
     frame, times = (3.0, -7.0, 2.5), range(1, 9)
     rows = [(0.5 * k, 0.1 * k, turned) for k in times]
     found = PlannedTrajectory.of(list(times), rows, frame)

@@ -1,4 +1,4 @@
-"""Scores against episodes worked out by hand."""
+"""Scores of episodes calculated by hand."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def hit(instants: list[Instant], step: int, **note) -> list[Instant]:
 # --- a drive without fault --------------------------------------------------------------------
 
 
-def test_the_recorded_drive_itself_is_perfect():
+def test_the_recorded_drive_gets_full_scores():
     found = scores(drive([10.0] * 41), context(40))
     assert found["pdms"].value == 1.0
     assert found["nuplan_cls"].value == 1.0
@@ -52,7 +52,7 @@ def test_the_recorded_drive_itself_is_perfect():
     assert found["feasible"].value == 1.0
 
 
-def test_every_score_has_a_version_that_the_published_string_names():
+def test_the_metrics_version_lists_every_score():
     published = scoring.metrics_version().split()
     found = scores(drive([10.0] * 3), context(2))
     assert published == [f"{s.name}@{s.version}" for s in found.values()]
@@ -61,7 +61,7 @@ def test_every_score_has_a_version_that_the_published_string_names():
 # --- progress ---------------------------------------------------------------------------------
 
 
-def test_half_the_way_is_half_the_progress():
+def test_half_the_distance_is_half_the_progress():
     # 20 of 40 m: PDMS (5/2 + 5 + 2)/12, CLS (5/2 + 5 + 4 + 2)/16, HD route 20/36.
     found = scores(drive([5.0] * 41), context(40))
     assert found["pdms"].value == pytest.approx(9.5 / 12)
@@ -71,25 +71,25 @@ def test_half_the_way_is_half_the_progress():
     assert found["alpasim"].value == pytest.approx(0.5 / 0.8)
 
 
-def test_making_no_way_is_worth_nothing_to_nuplan():
+def test_nuplan_gives_zero_without_progress():
     # 4 of 40 m is less than a fifth.
     assert scores(drive([1.0] * 41), context(40))["nuplan_cls"].value == 0.0
 
 
 def slow(speed: float) -> ScoringContext:
-    """The recorded drive at another speed [m/s]."""
+    """A context whose recorded drive has another speed [m/s]."""
     way = tuple(speed * DT * k for k in range(41))
     return context(40, expert_s=way, route_end_s=way[-1])
 
 
-def test_a_short_recorded_drive_is_measured_all_the_same_and_the_scores_say_so():
+def test_a_short_recorded_drive_is_scored_and_noted():
     found = scores(drive([0.0] * 41), slow(1.0))
     assert found["pdms"].terms["EP"] == found["alpasim"].value == found["carla_ds"].value == 0.0
     for name in ("pdms", "alpasim"):
         assert "the recorded drive is short (4.0 m)" in " ".join(found[name].assumed)
 
 
-def test_where_the_recorded_drive_stands_standing_is_right_and_the_scores_say_so():
+def test_standing_is_perfect_when_the_recorded_ego_stands():
     found = scores(drive([0.0] * 41), slow(0.1))
     assert found["pdms"].value == found["alpasim"].value == 1.0
     for name in ("pdms", "nuplan_cls", "hugsim_hd", "carla_ds", "alpasim"):
@@ -100,8 +100,8 @@ def test_where_the_recorded_drive_stands_standing_is_right_and_the_scores_say_so
 # --- the warm-up ------------------------------------------------------------------------------
 
 
-def test_steps_of_the_warm_up_do_not_count():
-    # Of 40 steps 20 are warm-up: with a hit and a stop that nobody likes, at half the way.
+def test_warm_up_steps_do_not_count():
+    # 20 of 40 steps are warm-up, with a hit and a hard stop.
     speeds = [10.0] * 10 + [0.0] * 11 + [10.0] * 20
     rough = hit(drive(speeds), 15)
     found = scores(rough, context(40, warmup_steps=20))
@@ -120,14 +120,14 @@ def test_steps_of_the_warm_up_do_not_count():
 
 
 def test_progress_is_measured_from_the_end_of_the_warm_up():
-    # 5 m/s over the last 20 steps are half of the recorded way in the same time.
+    # The last 20 steps slow to 5 m/s; the recorded drive covers 20 m in that time.
     speeds = [10.0] * 21 + [9.0, 8.0, 7.0, 6.0] + [5.0] * 16
     found = scores(drive(speeds), context(40, warmup_steps=20))
     assert found["pdms"].terms["EP"] == pytest.approx(sum(speeds[21:]) * DT / 20.0)
     assert found["carla_ds"].terms["RC"] == pytest.approx(sum(speeds[21:]) * DT / 20.0)
 
 
-def test_speeding_costs_by_how_much_for_how_long():
+def test_the_speeding_penalty_grows_with_the_excess():
     # 3 m/s too fast all the time: 1 - 3/2.23 is below 0; 1 m/s: 1 - 1/2.23.
     assert scores(drive([10.0] * 41), context(40, speed_limit=7.0))["nuplan_cls"].terms["SL"] == 0.0
     limited = scores(drive([10.0] * 41), context(40, speed_limit=9.0))["nuplan_cls"]
@@ -142,7 +142,7 @@ def test_speeding_costs_by_how_much_for_how_long():
     ("category", "nc", "carla"),
     [("car", 0.0, 60.0), ("pedestrian", 0.0, 50.0), ("pole", 0.5, 65.0)],
 )
-def test_a_hit_costs_by_what_was_hit(category, nc, carla):
+def test_the_collision_penalty_depends_on_the_category(category, nc, carla):
     found = scores(hit(drive([10.0] * 41), 20, category=category), context(40))
     assert found["pdms"].terms["NC"] == nc
     assert found["pdms"].value == pytest.approx(nc)
@@ -151,7 +151,7 @@ def test_a_hit_costs_by_what_was_hit(category, nc, carla):
 
 
 @pytest.mark.parametrize("side", ["rear", "stopped_ego", "lateral"])
-def test_being_hit_in_its_own_lane_is_not_the_egos_fault(side):
+def test_being_hit_in_its_lane_is_not_the_egos_fault(side):
     found = scores(hit(drive([10.0] * 41), 20, side=side), context(40))
     assert found["pdms"].value == 1.0
     assert found["carla_ds"].value == pytest.approx(60.0)
@@ -165,34 +165,34 @@ def test_a_lateral_hit_across_the_lane_line_is_the_egos_fault():
 
 
 @pytest.mark.parametrize(("since", "nc"), [(0.1, 1.0), (0.9, 0.0)])
-def test_fault_is_that_of_the_moment_of_contact(since, nc):
-    # Within one long step the ego goes over the lane line, at 0.825 m.
+def test_fault_is_judged_at_the_time_of_contact(since, nc):
+    # The ego crosses the lane line within one step, at an offset of 0.825 m.
     instants = drive([10.0] * 41)
     shifted = [replace(i, ego=i.ego._replace(y=1.5, offset=1.5)) for i in instants[20:]]
     changing = hit([*instants[:20], *shifted], 20, side="lateral", since=since)
     assert scores(changing, context(40))["pdms"].terms["NC"] == nc
 
 
-def test_an_object_counts_once_however_often_it_is_touched():
+def test_repeated_contacts_with_an_object_count_once():
     twice = hit(hit(drive([10.0] * 41), 20, category="pole"), 30, category="pole")
     found = scores(twice, context(40))
     assert found["nuplan_cls"].terms["NC"] == 0.5
     assert found["delta_v"].terms["secondary_collisions"] == 1.0
 
 
-def test_neuroncap_compares_with_the_impact_without_action():
+def test_neuroncap_is_relative_to_the_no_action_impact():
     instants = hit(drive([10.0] * 41), 20, relative_speed=4.0)
     found = scores(instants, context(40, no_action_impact=10.0))["neuroncap"]
     assert found.value == pytest.approx(4 * (1 - 0.4))
     assert scores(instants, context(40, no_action_impact=3.0))["neuroncap"].value == 0.0
 
 
-def test_hugsim_gives_nothing_for_steps_in_contact():
+def test_hugsim_gives_zero_for_steps_in_contact():
     found = scores(hit(drive([10.0] * 41), 20), context(40))
     assert found["hugsim_hd"].terms["mean"] == pytest.approx(39 / 40)
 
 
-def test_delta_v_is_the_change_of_velocity_by_an_impact():
+def test_delta_v_sums_the_impulses_of_an_impact():
     # 4 m/s in one step, 1 m/s in the next: 7500 N s on 1500 kg.
     instants = drive([10.0] * 20 + [6.0] + [5.0] * 20)
     instants = hit(instants, 20, impulse=(-6000.0, 0.0))
@@ -203,7 +203,7 @@ def test_delta_v_is_the_change_of_velocity_by_an_impact():
     assert found.terms["post_impact_displacement"] == pytest.approx(9.5 + 0.5)
 
 
-def test_an_engine_that_pushes_against_a_wall_adds_nothing_to_delta_v():
+def test_engine_thrust_against_a_wall_does_not_add_to_delta_v():
     instants = hit(drive([10.0] * 20 + [0.0] * 21), 20, impulse=(-15_000.0, 0.0))
     for step in range(21, 41):
         instants = hit(instants, step, impulse=(-600.0, 0.0), begun=False)
@@ -224,12 +224,12 @@ HERE = (0.0, 0.0, 0.0, 4.6, 1.85)
         ((3.4, 2.0, 1.57, 4.0, 2.4), 10.0, 9.0, "front"),
     ],
 )
-def test_sides_of_a_contact_are_those_of_nuplan(box, ego_speed, speed, side):
+def test_contact_sides_match_nuplan(box, ego_speed, speed, side):
     assert side_of_contact(HERE, ego_speed, box, speed, axle=1.35) == side
 
 
-def test_sides_are_those_of_navsim_for_overlaps_at_random():
-    # NAVSIM: behind is seen from the rear axle, not from the middle; speeds have both components.
+def test_contact_sides_match_navsim_for_random_overlaps():
+    # NAVSIM measures the bearing from the rear axle, not the centre, and uses full speeds.
     rng = np.random.default_rng(5)
     bumper = np.stack([np.full(4001, 2.3), np.linspace(-0.925, 0.925, 4001)], 1)
     behind_middle = 0
@@ -260,7 +260,7 @@ def ttc_of(others: ObjectSamples, *, y: float = 0.0, speed: float = 10.0) -> flo
     return accumulator.ttc
 
 
-def test_time_to_collision_is_gap_by_closing_speed():
+def test_time_to_collision_is_gap_over_closing_speed():
     # Front bumper at 1 + 3.65 m, rear end at 30 - 2 m: 23.35 m at 10 m/s, and at 4 m/s.
     assert ttc_of(car(30.0)) == pytest.approx(2.4)
     assert ttc_of(car(18.0, speed=6.0)) == pytest.approx(2.9)
@@ -271,28 +271,28 @@ def test_time_to_collision_is_gap_by_closing_speed():
     [car(30.0, speed=10.0), car(-8.0, speed=30.0), car(30.0, 3.0), car(60.0)],
     ids=["as fast", "behind", "beside", "far"],
 )
-def test_there_is_no_time_to_collision_without_collision(others):
+def test_time_to_collision_is_infinite_without_a_collision(others):
     assert ttc_of(others) == math.inf
 
 
-def test_a_standing_ego_collides_with_nobody():
+def test_a_standing_ego_has_no_time_to_collision():
     assert ttc_of(car(8.0, speed=-5.0), speed=0.0) == math.inf
 
 
-def test_what_an_ego_that_drives_backwards_comes_near_to_is_behind_it():
+def test_a_reversing_ego_has_time_to_collision_with_cars_behind():
     # Its tail at -0.4 - 0.95 m, the car's front at -8 + 2 m: 4.65 m at 4 m/s.
     assert ttc_of(car(-8.0), speed=-4.0) == pytest.approx(1.2)
     assert ttc_of(car(8.0), speed=-4.0) == math.inf
 
 
-def test_an_ego_in_reverse_gear_runs_into_what_is_behind_it():
+def test_a_reversing_ego_hits_cars_behind_with_its_front_side():
     box = (-4.0, 0.0, 0.0, 4.0, 2.0)
     assert side_of_contact(HERE, 3.0, box, 1.0, axle=1.35) == "rear"
     assert side_of_contact(HERE, 3.0, box, 1.0, axle=1.35, reversing=True) == "front"
 
 
 @pytest.mark.parametrize(("facing", "progress"), [(0.0, 1.0), (math.pi, 0.0)])
-def test_way_driven_tail_first_is_no_progress(facing, progress):
+def test_driving_tail_first_is_not_progress(facing, progress):
     given = context(40, expert_s=tuple(0.4 * k for k in range(41)), route_end_s=16.0)
     speed = math.copysign(4.0, math.cos(facing))
     instants = [
@@ -308,8 +308,8 @@ def test_way_driven_tail_first_is_no_progress(facing, progress):
     assert ("16 m of the route driven in reverse" in found["neuroncap"].cannot_see) == bool(facing)
 
 
-def test_coming_too_near_costs_the_ttc_term():
-    # 0.8 s from a car that is there for a moment.
+def test_a_short_time_to_collision_costs_the_ttc_term():
+    # A car 0.8 s ahead, for one step.
     near = drive([10.0] * 41, others=lambda k: car(14.0 + k) if k == 20 else NOBODY)
     moved = [
         replace(i, others=car(i.ego.x + 3.65 + 2.0 + 7.5)) if i.step == 20 else i for i in near
@@ -326,21 +326,21 @@ def test_coming_too_near_costs_the_ttc_term():
 @pytest.mark.parametrize(
     ("y", "dac", "nuplan_dac"), [(2.5, 1.0, 1.0), (2.7, 0.0, 1.0), (2.95, 0.0, 0.0)]
 )
-def test_leaving_the_corridor_with_a_corner_counts(y, dac, nuplan_dac):
+def test_a_corner_outside_the_corridor_is_off_road(y, dac, nuplan_dac):
     # A corner is 0.925 m beside the ego; the corridor ends at 3.5 m, nuPlan tolerates 0.3 m.
     found = scores(drive([10.0] * 41, y=y), context(40))
     assert found["pdms"].terms["DAC"] == dac
     assert found["nuplan_cls"].terms["DAC"] == nuplan_dac
 
 
-def test_recorded_lanes_of_others_are_drivable_too():
+def test_recorded_lanes_of_others_are_drivable():
     lane = np.stack([np.arange(0.0, 100.0), np.full(100, 3.5)], axis=1)
     found = scores(drive([10.0] * 41, y=3.5), context(40, lanes=(lane,)))
     assert found["pdms"].terms["DAC"] == 1.0
 
 
 @pytest.mark.parametrize(("speed", "ddc"), [(-1.5, 1.0), (-4.0, 0.5), (-7.0, 0.0)])
-def test_driving_against_the_route_counts_by_the_way_within_a_second(speed, ddc):
+def test_driving_against_the_route_counts_by_distance_per_second(speed, ddc):
     instants = [
         replace(i, ego=ego(100.0 + speed * DT * i.step, speed=speed)) for i in drive([0.0] * 41)
     ]
@@ -362,7 +362,7 @@ def test_longitudinal_bounds_hold_for_steady_acceleration(acceleration, comforta
 @pytest.mark.parametrize(
     ("acceleration", "comfortable"), [(-2.3, True), (-2.5, False), (4.0, True), (4.2, False)]
 )
-def test_backwards_the_bounds_are_those_of_the_mirror_image(acceleration, comfortable):
+def test_longitudinal_bounds_are_mirrored_in_reverse(acceleration, comfortable):
     window = comfort_window(DT)
     t = (np.arange(window) - window // 2) * DT
     felt = comfort_sample(np.stack([-8.0 + acceleration * t, 0 * t], axis=1), DT)
@@ -383,28 +383,28 @@ def test_derivatives_are_exact_for_cubics():
     assert felt.jerk == pytest.approx(math.hypot(0.4, 0.5 * 0.3 + 8.0 * 0.2))
 
 
-def test_the_first_window_of_comfort_waits_for_no_module(monkeypatch):
-    # Loaded within a step, the module made one wait for a second.
+def test_comfort_does_not_import_scipy_signal(monkeypatch):
+    # Importing the module during a step would take a second.
     monkeypatch.setitem(sys.modules, "scipy.signal", None)
     samples = np.stack([np.linspace(5.0, 6.0, 17), np.zeros(17)], axis=1)
     assert comfort_sample(samples, 0.087).lon_acceleration == pytest.approx(1 / 16 / 0.087)
 
 
-def test_comfort_recovers_in_hugsim_and_has_bounds_of_its_own():
-    # A jerk of 6 m/s^3 ahead is beyond the 4.13 of nuPlan, within the 8.37 of HUGSIM.
+def test_hugsim_comfort_recovers_and_has_its_own_bounds():
+    # A longitudinal jerk of 6 m/s^3 exceeds nuPlan's 4.13, but not HUGSIM's 8.37.
     t = DT * np.arange(16)
     rough = [10.0] * 20 + (10.0 + 3.0 * t**2)[:8].tolist() + [11.5] * 33
     hasty = scores(drive(rough), context(60))
     assert hasty["pdms"].terms["C"] == 0.0
     braked = scores(drive([10.0] * 20 + [9.1, 8.2, 7.3, 6.4, 5.5] + [5.5] * 36), context(60))
     assert braked["pdms"].terms["C"] == 0.0
-    # Only the steps whose window holds the braking lose 2 of 7.
+    # Only steps whose window contains the braking lose 2/7.
     lost = (1.0 - braked["hugsim_hd"].terms["mean"]) * 60 / (2 / 7)
     assert 5 <= round(lost) <= 20
     assert lost == pytest.approx(round(lost), abs=1e-6)
 
 
-def test_driving_beside_the_route_all_the_way_completes_nothing():
+def test_driving_beside_the_route_gives_no_route_completion():
     beside = scores(drive([10.0] * 41, y=2.9), context(40))
     assert beside["carla_ds"].value == 0.0
     assert beside["carla_ds"].terms["in_lanes"] == 0.0
@@ -412,13 +412,13 @@ def test_driving_beside_the_route_all_the_way_completes_nothing():
 
 
 @pytest.mark.parametrize(("turn", "share"), [(1, 1.0), (-1, 0.0)])
-def test_a_lane_that_others_drove_the_same_way_is_a_lane(turn, share):
+def test_lanes_driven_by_others_count_in_their_direction(turn, share):
     lane = np.stack([np.arange(0.0, 100.0)[::turn], np.full(100, 3.0)], axis=1)
     found = scores(drive([10.0] * 41, y=2.9), context(40, lanes=(lane,)))["carla_ds"]
     assert found.terms["in_lanes"] == pytest.approx(share)
 
 
-def test_a_stop_no_car_can_make_is_infeasible():
+def test_an_impossible_deceleration_is_infeasible():
     found = scores(drive([10.0] * 10 + [8.0] * 10), context(19))
     assert found["kinematic_infeasibility"].value == 1.0
 
@@ -443,12 +443,12 @@ def test_epdms_needs_successive_plans():
     assert found.missing
 
 
-def test_epdms_is_1_for_a_drive_without_fault():
+def test_epdms_is_1_for_a_faultless_drive():
     steady = with_plans(drive([10.0] * 41), lambda _k: 10.0)
     assert scores(steady, context(40))["epdms"].value == pytest.approx(1.0)
 
 
-def test_plans_that_jump_cost_extended_comfort():
+def test_inconsistent_plans_lose_extended_comfort():
     def braking(step: int) -> float:
         return 10.0
 
@@ -463,7 +463,7 @@ def test_plans_that_jump_cost_extended_comfort():
     assert found.value == pytest.approx(14 / 16)
 
 
-def test_two_seconds_beside_the_lane_cost_lane_keeping():
+def test_two_seconds_off_the_lane_centre_lose_lane_keeping():
     short = with_plans(drive([10.0] * 20, y=0.6), lambda _k: 10.0)
     assert scores(short, context(19))["epdms"].terms["LK"] == 1.0
     long = with_plans(drive([10.0] * 22, y=0.6), lambda _k: 10.0)

@@ -1,4 +1,4 @@
-"""Road users that an edit adds to a running episode, and takes away again."""
+"""Road users that edits add to and remove from a running episode."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ AHEAD = {"recorded_id": "car", "place": {"ahead": 30.0}, "speed": 8.0}
 
 @pytest.fixture
 def street(make_world, moving):
-    """A world with one parked car, which others may look like."""
+    """Make a world with one parked car to copy the appearance from."""
     return lambda **spec: make_world(car=moving(40, 9, z=0.8), spec=CONTROL | spec)
 
 
@@ -44,7 +44,7 @@ def agent(world: World, object_id: str = "spawned_1") -> dict | None:
     return next((a for a in agents if a["object_id"] == object_id), None)
 
 
-def test_a_car_spawned_ahead_is_there_at_once_and_drives_on(street):
+def test_a_car_spawned_ahead_appears_at_once_and_drives_on(street):
     world = street()
     for _ in range(10):
         world.step(COAST)
@@ -59,7 +59,7 @@ def test_a_car_spawned_ahead_is_there_at_once_and_drives_on(street):
     assert agent(world)["position"][0] - before == pytest.approx(8.0, abs=1.0)
 
 
-def test_a_spawned_car_follows_the_ego_behind_it(street):
+def test_a_car_spawned_behind_the_ego_follows_it(street):
     world = street()
     world.apply([Spawn(recorded_id="car", place={"ahead": -15.0}, speed=10.0)])
     for _ in range(60):
@@ -79,7 +79,7 @@ def test_an_oncoming_car_keeps_to_its_lane(street):
     assert found["position"][1] == pytest.approx(3.5, abs=0.05)
 
 
-def test_a_pose_in_the_world_and_a_driver_may_be_given(street):
+def test_a_world_pose_and_a_driver_can_be_given(street):
     world = street()
     pose = {"position": (50.0, -2.0, 5.0), "quaternion": (1.0, 0.0, 0.0, 0.0)}
     spec = {"pose": pose, "speed": 6.0, "driver": {"kind": "constant_velocity"}}
@@ -90,7 +90,7 @@ def test_a_pose_in_the_world_and_a_driver_may_be_given(street):
     assert agent(world, "mine")["position"] == pytest.approx([56.0, -2.0, 0.8])
 
 
-def test_another_client_drives_it_where_its_driver_is_external(street):
+def test_an_external_driver_follows_the_agent_plan(street):
     world = street()
     world.apply([Spawn(**AHEAD, driver={"kind": "external"})])
     world.set_agent_plan("spawned_1", [world.t_us + 100_000], [(25.0, 1.0, 0.5)])
@@ -98,7 +98,7 @@ def test_another_client_drives_it_where_its_driver_is_external(street):
     assert agent(world)["position"][:2] == pytest.approx([25.0, 1.0])
 
 
-def test_a_deleted_one_is_gone(street):
+def test_a_deleted_spawned_car_disappears(street):
     world = street()
     world.apply([Spawn(**AHEAD)])
     world.step(COAST)
@@ -108,7 +108,7 @@ def test_a_deleted_one_is_gone(street):
     assert agent(world) is None
 
 
-def test_one_that_is_to_appear_later_does(street):
+def test_a_spawned_car_can_appear_later(street):
     world = street()
     world.apply([Spawn(**AHEAD, start_us=world.t_us + 500_000)])
     seen = []
@@ -118,7 +118,7 @@ def test_one_that_is_to_appear_later_does(street):
     assert seen == [False] * 4 + [True] * 4
 
 
-def test_it_appears_beyond_the_log_and_comes_along_over_the_seam(street):
+def test_a_car_spawned_beyond_the_log_crosses_the_seam(street):
     world = street(beyond_log="loop", horizon=300)
     while world.steps < 230:
         world.step(COAST)
@@ -129,7 +129,7 @@ def test_it_appears_beyond_the_log_and_comes_along_over_the_seam(street):
     assert 20.0 < gap < 45.0
 
 
-def test_the_driver_of_a_scenario_moves_it_in_every_episode(make_scene, moving):
+def test_a_car_spawned_in_a_scenario_drives_in_every_episode(make_scene, moving):
     scene = make_scene(car=moving(40, 9, z=0.8))
     pose = {"position": (30.0, 0.0, 0.0)}
     spawn = Spawn(recorded_id="car", pose=pose, speed=8.0)
@@ -142,7 +142,7 @@ def test_the_driver_of_a_scenario_moves_it_in_every_episode(make_scene, moving):
         assert agent(world)["velocity"][0] == pytest.approx(8.0, abs=0.5)
 
 
-def test_the_driver_of_a_reset_goes_first(make_scene, moving):
+def test_the_driver_of_the_reset_takes_precedence(make_scene, moving):
     scene = make_scene(car=moving(40, 9, z=0.8))
     pose = {"position": (30.0, 0.0, 0.0)}
     state = apply_operations(
@@ -176,7 +176,7 @@ def test_spawned_cars_are_part_of_replay(make_scene, moving):
     assert made.instants[-1].others.ids == ("car", "spawned_2", "spawned_3")
 
 
-def test_a_fork_goes_on_alike(street):
+def test_a_fork_continues_identically(street):
     world = street()
     world.apply([Spawn(**AHEAD)])
     world.step(COAST)
@@ -186,7 +186,7 @@ def test_a_fork_goes_on_alike(street):
     assert digest(fork) == digest(world)
 
 
-def test_a_place_beside_the_route_needs_a_session(make_scene, moving):
+def test_a_place_relative_to_the_ego_needs_a_session(make_scene, moving):
     state = ScenarioState.of(make_scene(car=moving(40, 9, z=0.8)))
     with pytest.raises(EditError, match="running session") as refused:
         apply_operations(state, [Spawn(**AHEAD)])
@@ -202,17 +202,17 @@ def test_a_place_beside_the_route_needs_a_session(make_scene, moving):
         {"recorded_id": "car", "place": {"ahead": 5.0}, "pose": {"position": (0, 0, 0)}},
     ],
 )
-def test_a_spawn_names_one_look_and_one_place(wrong):
+def test_a_spawn_needs_exactly_one_look_and_one_place(wrong):
     with pytest.raises(ValidationError, match="either"):
         Spawn(**wrong)
 
 
-def test_a_look_that_does_not_exist_is_refused(street):
+def test_an_unknown_look_is_refused(street):
     with pytest.raises(EditError, match="no object 'ghost'"):
         street().apply([Spawn(recorded_id="ghost", place={"ahead": 30.0})])
 
 
-def test_idm_along_the_route_bends_with_it(make_scene, moving):
+def test_idm_follows_the_bend_of_the_route(make_scene, moving):
     from real2sim_server.scene import Trajectory
 
     times = moving(0).times_us

@@ -1,4 +1,4 @@
-"""People whom a storyboard leads walk by the distance that they cover."""
+"""Walking animation of storyboard pedestrians by distance covered."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from real2sim_server.world.sensing import ray_targets
 
 @pytest.fixture(scope="module")
 def crossing():
-    """The world at each step while an adult crosses at 1.39 m/s."""
+    """Worlds at each step while an adult crosses the road at 1.39 m/s."""
     fields = corner_case("cpna").storyboard().model_dump()
     speed = {"entity": "Ego", "action": {"kind": "speed", "speed": 10.0}}
     board = Storyboard.model_validate(fields | {"init": [*fields["init"], speed]})
@@ -47,7 +47,7 @@ def drawn(world) -> torch.Tensor:
     return world.instances()[1 + row_of(world)].cloud.means
 
 
-def test_who_crosses_makes_steps_by_the_distance(crossing):
+def test_the_stride_phase_advances_with_distance(crossing):
     name = walker(crossing[0])
     steps = [w.strides.made[name].steps for w in crossing[1:]]
     speeds = [np.linalg.norm(w.agents.velocities[row_of(w)][:2]) for w in crossing[1:]]
@@ -58,7 +58,7 @@ def test_who_crosses_makes_steps_by_the_distance(crossing):
     np.testing.assert_allclose(made[8:], 0.139 / 0.67, rtol=0.15)
 
 
-def test_legs_of_who_walks_differ_from_step_to_step_and_of_who_waits_do_not(crossing):
+def test_legs_move_only_while_walking(crossing):
     speeds = np.array([np.linalg.norm(w.agents.velocities[row_of(w)][:2]) for w in crossing])
     waiting = next(k for k in range(1, len(speeds)) if speeds[k] == speeds[k + 1] == 0)
     walking = next(k for k in range(len(speeds)) if (speeds[k : k + 12] > 1.3).all()) + 10
@@ -67,20 +67,20 @@ def test_legs_of_who_walks_differ_from_step_to_step_and_of_who_waits_do_not(cros
     assert float(moved.max()) > 0.1
 
 
-def test_a_person_is_as_tall_as_asked_and_no_wider_than_people_are(crossing):
+def test_a_pedestrian_is_scaled_uniformly(crossing):
     world = crossing[0]
     subject = world.agents.objects[row_of(world)]
     assert subject.scaled_size == pytest.approx((0.5, 0.6, 1.8))
     assert len(set(subject.scale)) == 1
 
 
-def test_lidars_meet_the_person_that_cameras_see(crossing):
+def test_lidars_and_cameras_use_the_same_cloud(crossing):
     world = crossing[-20]
     met = ray_targets(world).instances[1 + row_of(world)]
     assert torch.equal(met.cloud.means, drawn(world))
 
 
-def test_forks_walk_on_alike(crossing):
+def test_forks_walk_identically(crossing):
     one, other = crossing[30].fork(), crossing[30].fork()
     for _ in range(5):
         one.step()

@@ -28,8 +28,8 @@ def after(motion: Motion, seconds: float, *, dt: float = 0.1, start: BodyAttitud
     return attitude
 
 
-def test_braking_dives_by_the_load_transfer_over_the_springs():
-    # By hand: m a h / L on springs m_axle (2 pi f)^2, both ends of the wheelbase, less 30 %.
+def test_dive_angle_is_load_transfer_over_spring_stiffness():
+    # Load transfer m a h / L on springs m_axle (2 pi f)^2 at both axles, less 30 %.
     m, h, length, a = 1500.0, 0.55, 2.8, 4.0
     front = m * 0.56 * (2 * math.pi * 1.3) ** 2
     rear = m * 0.44 * (2 * math.pi * 1.5) ** 2
@@ -40,26 +40,26 @@ def test_braking_dives_by_the_load_transfer_over_the_springs():
     assert math.degrees(pitch) == pytest.approx(1.44 * a / GRAVITY, abs=0.02)
 
 
-def test_a_left_turn_rolls_to_the_right_by_about_four_degrees_a_g():
+def test_a_left_turn_rolls_right_by_four_degrees_per_g():
     roll = after(TURNING_LEFT, 5.0).roll
 
     assert math.degrees(roll) == pytest.approx(3.9 * 3.0 / GRAVITY, rel=0.02)
 
 
-def test_left_and_right_and_drive_and_brakes_are_mirrored():
+def test_roll_and_pitch_are_symmetric():
     right, driving = TURNING_LEFT._replace(yaw_rate=-0.3), BRAKING._replace(acceleration=4.0)
 
     assert after(right, 0.4).roll == pytest.approx(-after(TURNING_LEFT, 0.4).roll)
     assert after(driving, 0.4).pitch == pytest.approx(-after(BRAKING, 0.4).pitch)
 
 
-def test_a_body_comes_to_rest_level_at_constant_velocity():
+def test_the_body_levels_at_constant_velocity():
     tilted_body = BodyAttitude(0.03, 0.1, -0.05, 0.2)
 
     assert after(STEADY, 10.0, start=tilted_body) == pytest.approx((0.0,) * 4, abs=1e-9)
 
 
-def test_it_overshoots_as_a_damped_oscillator_does():
+def test_pitch_overshoots_like_a_damped_oscillator():
     rest = after(BRAKING, 10.0).pitch
     highest = max(after(BRAKING, 0.01 * k, dt=0.01).pitch for k in range(1, 80))
 
@@ -68,19 +68,19 @@ def test_it_overshoots_as_a_damped_oscillator_does():
 
 
 @pytest.mark.parametrize("dt", [0.01, 0.05, 0.5, 1.0])
-def test_the_step_length_does_not_matter(dt):
+def test_attitude_does_not_depend_on_the_time_step(dt):
     assert after(BRAKING, 1.0, dt=dt) == pytest.approx(after(BRAKING, 1.0), abs=1e-12)
 
 
-def test_what_tyres_cannot_give_does_not_tilt():
+def test_tilt_is_limited_by_tyre_friction():
     impact = BRAKING._replace(acceleration=-200.0)
     most = BRAKING._replace(acceleration=-0.9 * GRAVITY)
 
     assert after(impact, 1.0) == after(most, 1.0)
 
 
-def test_tyres_and_springs_get_the_same_load():
-    # Sliding tyres give friction times load, which shows it: more by the transfer when braking.
+def test_tyres_carry_the_load_transfer_of_the_springs():
+    # The force of sliding tyres is friction times load, so it shows the transfer.
     vehicle = vehicle_parameters(EgoSpec(dynamics="dynamic_bicycle"))
     free, braked = (axle_forces(vehicle, (20.0, 0.0, 0.0), 0.5, a)[0] for a in (0.0, -4.0))
     grip = math.sqrt(0.9**2 - (4.0 / GRAVITY) ** 2)
@@ -104,7 +104,7 @@ def driven(make_world, **ego):
     return world
 
 
-def test_cameras_see_it_and_contact_does_not(make_world):
+def test_suspension_affects_cameras_but_not_motion(make_world):
     rigid, sprung_world = driven(make_world, suspension=None), driven(make_world)
 
     assert rigid.T_world_body is rigid.T_world_vehicle
@@ -114,7 +114,7 @@ def test_cameras_see_it_and_contact_does_not(make_world):
     assert math.radians(0.3) < -math.asin(ahead[2]) < math.radians(1.0)
 
 
-def test_the_ego_says_how_its_body_is_tilted(make_world):
+def test_the_ego_quaternion_includes_the_tilt(make_world):
     world = driven(make_world, suspension={})
     w, x, y, z = world.observe().ego_fields()["quaternion"]
 
@@ -122,7 +122,7 @@ def test_the_ego_says_how_its_body_is_tilted(make_world):
     assert 2 * (y * z + w * x) == pytest.approx(world.T_world_body[2, 1])
 
 
-def test_a_copied_world_tilts_alike(make_world):
+def test_a_fork_tilts_identically(make_world):
     world = driven(make_world, suspension={})
     copy = world.fork()
     for w in (world, copy):
@@ -131,7 +131,7 @@ def test_a_copied_world_tilts_alike(make_world):
     np.testing.assert_array_equal(world.T_world_body, copy.T_world_body)
 
 
-def test_who_is_put_somewhere_is_level(make_world):
+def test_a_teleported_ego_is_level(make_world):
     world = make_world(spec={"action": "pose", "ego": {"suspension": {}}})
     world.step(PoseCommand(x=30.0, y=0.0, yaw=0.0))
 

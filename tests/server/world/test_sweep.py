@@ -1,4 +1,4 @@
-"""Contact between the instants of the clock."""
+"""Contacts between time steps."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ from real2sim_server.world.replay import (
 COAST = Control(acceleration=0.0, steering=0.0)
 CAR = (4.0, 2.0)
 FRONT = 3.65
-"""Rear axle to the front bumper of the ego [m]."""
+"""Distance from the ego's rear axle to its front bumper [m]."""
 
 
 def gaps(centres, yaws, sizes):
-    """Largest gap of two boxes along a normal of a side, for [T, 2] centres, [T] yaws of both."""
+    """Largest gap between two boxes along a face normal; centres [T, 2] and yaws [T] of both."""
     apart = centres[1] - centres[0]
     found = []
     for yaw in yaws:
@@ -54,7 +54,7 @@ def gaps(centres, yaws, sizes):
 
 
 def drive(world, plan=COAST):
-    """Collisions until the end of an episode."""
+    """Collision events until the end of the episode."""
     found = []
     while not world.over:
         found += [e for e in world.step(plan) if e.type == "collision"]
@@ -62,7 +62,7 @@ def drive(world, plan=COAST):
 
 
 def first_collisions(world):
-    """Collisions of the first step that has any."""
+    """Collision events of the first step with a collision."""
     while not world.over:
         if found := [e for e in world.step(COAST) if e.type == "collision"]:
             return found
@@ -74,7 +74,7 @@ def first_collisions(world):
 
 @settings(deadline=None, max_examples=100)
 @given(seed=st.integers(0, 100_000))
-def test_the_first_contact_is_that_of_a_dense_sampling(seed):
+def test_the_first_contact_matches_a_dense_sampling(seed):
     rng = np.random.default_rng(seed)
     fractions = np.linspace(0, 1, int(rng.integers(2, 5)))
     way = np.zeros((len(fractions), 5))
@@ -101,7 +101,7 @@ def test_the_first_contact_is_that_of_a_dense_sampling(seed):
         0.0,
         1e-3,
     )
-    # A touch less deep than the tolerance may be missed, and none is found where there is none.
+    # Overlaps shallower than the tolerance may be missed. There are no false contacts.
     if math.isfinite(first[0]):
         before = gap[t < first[0] - 2e-4]
         assert before.min(initial=1.0) > -2e-3
@@ -115,8 +115,8 @@ def test_the_first_contact_is_that_of_a_dense_sampling(seed):
 
 
 @pytest.mark.parametrize(("on_collision", "count"), [("terminate", 1000), ("continue", 200)])
-def test_of_a_thousand_fast_drives_none_passes_through_a_car(make_scene, on_collision, count):
-    # Where momentum is exchanged contacts begin in substeps of 10 ms.
+def test_no_random_fast_drive_passes_through_a_car(make_scene, on_collision, count):
+    # With momentum exchange, contacts start at substeps of 10 ms.
     late = 3e-3 if on_collision == "terminate" else 13e-3
     rng = np.random.default_rng(20)
     times = 5_000_000 + np.array([0, 3_000_000])
@@ -125,7 +125,7 @@ def test_of_a_thousand_fast_drives_none_passes_through_a_car(make_scene, on_coll
     for _ in range(count):
         speed, yaw = rng.uniform(10, 40), rng.uniform(-math.pi, math.pi)
         other = rng.uniform(0, 30) * np.array([math.cos(yaw), math.sin(yaw)])
-        # Around where the ego's middle is at some time of the drive.
+        # Near the ego's centre at a random time of the drive.
         when = rng.uniform(0.4, 2.6)
         place = np.array([1.35 + speed * when, 0.0]) + rng.uniform(-3, 3, 2) - other * when
         positions = np.zeros((2, 3))
@@ -134,7 +134,7 @@ def test_of_a_thousand_fast_drives_none_passes_through_a_car(make_scene, on_coll
         way = np.zeros((2, 3))
         way[1, 0] = 3 * speed
         ego = Trajectory(times, way, np.tile([1.0, 0.0, 0.0, 0.0], (2, 1)))
-        # Fitting the ground to each scene would take most of the time.
+        # Reuse the ground: fitting it for each scene is slow.
         scene = replace(make_scene(ego, car=car), stored_ground=flat)
         dt_us = int(rng.choice([50_000, 100_000, 200_000, 500_000, 1_000_000]))
         contact = {"dents": False}
@@ -158,7 +158,7 @@ def test_of_a_thousand_fast_drives_none_passes_through_a_car(make_scene, on_coll
 
 
 @pytest.mark.parametrize("dt_us", [50_000, 100_000, 500_000, 1_000_000])
-def test_time_place_and_speed_of_a_contact_do_not_depend_on_the_clock(make_world, moving, dt_us):
+def test_contact_time_place_and_speed_do_not_depend_on_the_time_step(make_world, moving, dt_us):
     at_once = {"actuators": {"steering_lag": 0.0, "drive_lag": 0.0}}
     spec = {"action": "control", "dt_us": dt_us, "ego": at_once}
     world = make_world(car=moving(45, 0, z=0.8), spec=spec)
@@ -173,8 +173,8 @@ def test_time_place_and_speed_of_a_contact_do_not_depend_on_the_clock(make_world
     assert (world.reason, world.metrics()["collisions"]) == ("collision", 1)
 
 
-def test_a_turn_into_a_car_between_two_instants_is_found(make_world, moving):
-    # A circle of 7 m: halfway round within the step, far from the straight way of it.
+def test_a_turn_into_a_car_within_a_step_is_detected(make_world, moving):
+    # A circle of 7 m radius: the arc of one step is far from its chord.
     spec = {"action": "control", "dt_us": 1_000_000, "ego": {"max_steer_rate": 10.0}}
     turn = Control(acceleration=0.0, steering=math.atan(2.8 / 7.0))
     aside = moving(7.6, 5.5, z=0.8)
@@ -193,7 +193,7 @@ def test_poses_that_jump_over_a_car_hit_it(make_world, moving, on_collision):
     assert [e.object_id for e in world.step(PoseCommand(x=30, y=0, yaw=0))] == ["car"]
 
 
-def test_a_plan_that_is_followed_perfectly_hits_what_lies_on_it(make_world, moving):
+def test_the_perfect_tracker_hits_objects_on_its_plan(make_world, moving):
     spec = {"dt_us": 1_000_000, "ego": {"tracker": "perfect"}}
     world = make_world(aside=moving(12, 7, z=0.8), spec=spec)
     times = [world.t_us + 250_000 * k for k in range(1, 5)]
@@ -204,7 +204,7 @@ def test_a_plan_that_is_followed_perfectly_hits_what_lies_on_it(make_world, movi
     assert [e.object_id for e in events] == ["aside"]
 
 
-def test_an_ego_that_stands_is_hit_by_a_car_that_passes_through_within_a_step(make_world, moving):
+def test_a_standing_ego_is_hit_by_a_car_crossing_within_a_step(make_world, moving):
     spec = {"action": "control", "dt_us": 1_000_000}
     crossing = moving(1.35, -20, z=0.8, speed=35.0, yaw=math.pi / 2)
     world = make_world(moving(), crossing=crossing, spec=spec)
@@ -214,7 +214,7 @@ def test_an_ego_that_stands_is_hit_by_a_car_that_passes_through_within_a_step(ma
     assert event.data["relative_speed"] == pytest.approx(35.0)
 
 
-def test_of_two_contacts_in_a_step_the_first_counts_for_the_speed(make_world, moving):
+def test_the_first_of_two_contacts_in_a_step_sets_the_impact_speed(make_world, moving):
     cars = {"far": moving(25, 0, z=0.8), "near": moving(15, 0, z=0.8, speed=4.0)}
     spec = {"action": "control", "dt_us": 1_000_000}
     world = make_world(moving(speed=30.0), **cars, spec=spec)
@@ -223,13 +223,13 @@ def test_of_two_contacts_in_a_step_the_first_counts_for_the_speed(make_world, mo
     assert world.accumulator.first_impact == pytest.approx(26.0)
 
 
-def test_a_bridge_is_passed_under_at_any_speed(make_world, moving):
+def test_driving_under_a_bridge_at_high_speed_is_not_a_contact(make_world, moving):
     world = make_world(moving(speed=30.0), bridge=moving(20, 0, z=6.0), spec={"dt_us": 1_000_000})
 
     assert drive(world, None) == []
 
 
-def test_what_moves_with_momentum_is_met_wherever_the_ego_can_turn_to(make_world, moving):
+def test_objects_beside_a_turning_ego_are_hit_within_a_step(make_world, moving):
     spec = {"dt_us": 1_000_000, "action": "control", "on_collision": "continue"}
     world = make_world(moving(speed=6.0), aside=moving(5.0, 4.3, z=0.8), spec=spec)
     world.motion = world.motion._replace(steering=0.6)
@@ -243,7 +243,7 @@ def test_what_moves_with_momentum_is_met_wherever_the_ego_can_turn_to(make_world
 
 @pytest.fixture(scope="module")
 def walled(make_scene) -> Scene:
-    """A wall, one cell thick, beside the recorded way."""
+    """A scene with a wall, one cell thick, beside the recorded path."""
     street = make_scene()
     x, z = np.meshgrid(np.arange(0.0, 60.0, 0.05), np.arange(0.5, 1.5, 0.2))
     points = np.stack([x, np.full_like(x, 6.1), z], -1).reshape(-1, 3)
@@ -260,11 +260,11 @@ def walled(make_scene) -> Scene:
 
 
 @pytest.mark.parametrize("dt_us", [50_000, 1_000_000])
-def test_no_wall_is_driven_through(walled, dt_us):
+def test_a_fast_ego_does_not_pass_through_a_wall(walled, dt_us):
     spec = ResetSpec(dt_us=dt_us, contact={"background": True}, ego={"tracker": "perfect"})
     world = World(walled, ScenarioState.of(walled), spec)
     times = [world.t_us + 1_000_000 * k for k in (1, 2)]
-    # Straight across the wall at 20 m/s.
+    # Through the wall at 20 m/s.
     poses = [(16.0, 12.0, 0.6435), (32.0, 24.0, 0.6435)]
     events = drive(world, TrajectoryPlan(times_us=times, poses=poses, frame="world"))
 
@@ -274,13 +274,13 @@ def test_no_wall_is_driven_through(walled, dt_us):
     assert event.data["contact_us"] < 5_600_000
 
 
-def test_driving_along_a_wall_is_no_contact(walled):
+def test_driving_along_a_wall_is_not_a_contact(walled):
     spec = ResetSpec(dt_us=500_000, action="control", contact={"background": True})
 
     assert drive(World(walled, ScenarioState.of(walled), spec)) == []
 
 
-def test_delta_v_at_a_wall_is_what_the_wall_takes_however_long_the_engine_pushes(walled):
+def test_delta_v_at_a_wall_excludes_engine_thrust(walled):
     contact = {"background": True, "dents": False}
     spec = ResetSpec(action="control", on_collision="continue", contact=contact)
     world = World(walled, ScenarioState.of(walled), spec)
@@ -292,7 +292,7 @@ def test_delta_v_at_a_wall_is_what_the_wall_takes_however_long_the_engine_pushes
 
     found = {s.name: s for s in world.scores()}["delta_v"]
     assert found.terms["impulse"] / world.context.ego_mass > fastest
-    # A pulse takes as long as the engine needs for 0.8 m/s, which the wall takes as well.
+    # The engine adds up to 0.8 m/s during the pulse.
     assert found.value == pytest.approx(max(impacts), abs=0.8)
 
 
@@ -300,9 +300,7 @@ def test_delta_v_at_a_wall_is_what_the_wall_takes_however_long_the_engine_pushes
 
 
 @pytest.mark.parametrize("on_collision", ["terminate", "continue"])
-def test_what_the_recorded_drive_runs_into_during_warm_up_is_no_contact(
-    make_world, moving, on_collision
-):
+def test_overlaps_during_the_warm_up_are_not_contacts(make_world, moving, on_collision):
     spec = {"warmup_us": 3_000_000, "horizon": 60, "on_collision": on_collision}
     world = make_world(car=moving(25, 0.0, z=0.8), spec=spec)
 
@@ -311,7 +309,7 @@ def test_what_the_recorded_drive_runs_into_during_warm_up_is_no_contact(
     assert world.steps == 60
 
 
-def test_an_episode_from_before_goes_on_through_what_it_passed_through(make_scene, moving):
+def test_an_old_episode_without_swept_contacts_replays(make_scene, moving):
     scene = make_scene(moving(speed=30.0), car=moving(20, 0, z=0.8))
     spec = ResetSpec(dt_us=1_000_000, action="control", contact={"swept": False})
     fields = decode(reset_payload(spec))
@@ -324,7 +322,7 @@ def test_an_episode_from_before_goes_on_through_what_it_passed_through(make_scen
     assert first_difference(made, Replayer.on(scene, ScenarioState.of(scene))) is None
 
 
-def test_the_reference_of_neuroncap_is_the_speed_at_the_first_contact(make_scene, moving):
+def test_the_no_action_impact_is_the_speed_at_first_contact(make_scene, moving):
     scene = make_scene(moving(speed=30.0), car=moving(20, 0, z=0.8, speed=5.0))
     log = [Entry("reset", 0, reset_payload(ResetSpec(dt_us=1_000_000)))]
 

@@ -1,4 +1,4 @@
-"""How well the vehicle follows plans, in closed loop."""
+"""Closed-loop tracking of plans."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ IDEAL = {"actuators": {"steering_lag": 0.0, "drive_lag": 0.0}}
 
 
 def s_curve(*, speed: float, curvature: float) -> Trajectory:
-    """An S of constant speed whose curvature swings between plus and minus ``curvature``."""
+    """An S-curve at constant speed with curvature between -``curvature`` and ``curvature``."""
     way = np.arange(121 * 100) * speed * 1e-3
     yaw = np.cumsum(curvature * np.sin(way / 15)) * speed * 1e-3
     x, y = np.cumsum(np.cos(yaw)) * speed * 1e-3, np.cumsum(np.sin(yaw)) * speed * 1e-3
@@ -30,7 +30,7 @@ def s_curve(*, speed: float, curvature: float) -> Trajectory:
 
 
 def logged_plan(world: World, *, poses: int, spacing_us: int, frame: str) -> TrajectoryPlan:
-    """The recorded future as a planner would send it."""
+    """The recorded future as a plan."""
     ego, motion = world.scene.ego, world.motion
     wanted = [world.t_us + spacing_us * (i + 1) for i in range(poses)]
     times = [t for t in wanted if t <= ego.end_us] or [ego.end_us]
@@ -47,7 +47,7 @@ def logged_plan(world: World, *, poses: int, spacing_us: int, frame: str) -> Tra
 
 
 def errors(world: World, **plan) -> np.ndarray:
-    """Distance [m] from the recorded place of the same time, at every step of the episode."""
+    """Distance [m] from the recorded position at every step of the episode."""
     distances = []
     while not world.over:
         world.step(logged_plan(world, **plan) if plan else None)
@@ -85,7 +85,7 @@ def test_without_a_plan_the_log_is_followed(make_world):
     assert errors(make_world(s_curve(speed=9.0, curvature=0.05))).max() < 0.3
 
 
-def test_a_narrow_turn_at_walking_pace_is_followed(make_world):
+def test_a_tight_turn_at_walking_pace_is_followed(make_world):
     world = make_world(s_curve(speed=1.5, curvature=0.15))
 
     assert errors(world, poses=30, spacing_us=100_000, frame="vehicle").max() < 0.2
@@ -93,7 +93,7 @@ def test_a_narrow_turn_at_walking_pace_is_followed(make_world):
 
 def test_a_start_and_a_stop_are_followed(make_world):
     seconds = np.arange(121) * 0.1
-    # Away from standstill with 1.5 m/s^2 at second 2, to a stop at second 10.
+    # Starts at 2 s with 1.5 m/s^2 and stops at 10 s.
     speed = np.clip(np.minimum(1.5 * (seconds - 2), 1.5 * (10 - seconds)), 0, None)
     x = np.cumsum(speed) * 0.1
     positions = np.stack([x, 0 * x, 0 * x], axis=1)
@@ -107,14 +107,13 @@ def test_a_start_and_a_stop_are_followed(make_world):
 
 
 def braking(seconds: float) -> float:
-    """Place [m] of a vehicle that brakes from 10 m/s at second 1, at 3 m/s^2."""
+    """Position [m] of a vehicle that brakes from 10 m/s at 3 m/s^2 after 1 s."""
     braked = min(max(seconds - 1, 0.0), 10 / 3)
     return 10 * min(seconds, 1.0) + 10 * braked - 1.5 * braked**2
 
 
 def driven(world: World, place, *, spacing_us: int, poses: int, steps: int) -> np.ndarray:
-    """Errors [m], speeds [m/s] and gears of a drive by plans that are made anew at every step, of
-    who is at ``place(seconds)`` at each time."""
+    """Errors [m], speeds [m/s] and reverse flags, replanning ``place(seconds)`` at every step."""
     found = []
     for _ in range(steps):
         times = [world.t_us + spacing_us * (k + 1) for k in range(poses)]
@@ -127,7 +126,7 @@ def driven(world: World, place, *, spacing_us: int, poses: int, steps: int) -> n
 
 @pytest.mark.parametrize("tracker", ["pursuit", "lqr", "ilqr"])
 @pytest.mark.parametrize(("poses", "spacing_us"), [(30, 100_000), (8, 500_000)])
-def test_a_stop_that_is_planned_anew_at_every_step_ends_where_it_is_planned(
+def test_a_stop_replanned_at_every_step_ends_at_the_planned_position(
     make_world, tracker, poses, spacing_us
 ):
     world = make_world(spec={"ego": {"tracker": tracker}})
@@ -140,7 +139,7 @@ def test_a_stop_that_is_planned_anew_at_every_step_ends_where_it_is_planned(
 
 @pytest.mark.parametrize("tracker", ["pursuit", "lqr", "ilqr"])
 @pytest.mark.parametrize("speed", [0.5, 1.5, 5.0])
-def test_plans_of_a_single_pose_are_caught_up_with_without_hunting(make_world, tracker, speed):
+def test_single_pose_plans_are_caught_up_without_oscillation(make_world, tracker, speed):
     ego = s_curve(speed=speed + 0.3, curvature=0.0)
     world = make_world(ego, spec={"ego": {"tracker": tracker}})
 
@@ -153,7 +152,7 @@ def test_plans_of_a_single_pose_are_caught_up_with_without_hunting(make_world, t
 
 
 @pytest.mark.parametrize("tracker", ["pursuit", "lqr", "ilqr"])
-def test_single_poses_that_stay_ahead_are_driven_up_to_and_stood_at(make_world, tracker):
+def test_the_vehicle_stops_at_a_fixed_single_pose(make_world, tracker):
     ego = s_curve(speed=0.0, curvature=0.0)
     world = make_world(ego, spec={"ego": {"tracker": tracker}})
 
@@ -164,7 +163,7 @@ def test_single_poses_that_stay_ahead_are_driven_up_to_and_stood_at(make_world, 
     assert found[-1, 1] == pytest.approx(0.0, abs=1e-4)
 
 
-def test_single_poses_that_lead_backwards_are_followed_in_reverse_gear(make_world):
+def test_backward_single_poses_are_followed_in_reverse_gear(make_world):
     world = make_world(s_curve(speed=0.0, curvature=0.0))
 
     found = driven(world, lambda t: -0.5 * t, spacing_us=100_000, poses=1, steps=60)
@@ -174,14 +173,14 @@ def test_single_poses_that_lead_backwards_are_followed_in_reverse_gear(make_worl
     assert np.abs(np.diff(found[:, 2])).sum() <= 1
 
 
-def test_trackers_of_an_old_log_know_nothing_of_the_way_to_a_plan():
+def test_old_logs_use_tracker_version_1():
     fields = ResetSpec().model_dump(mode="json")
     assert stored_spec(fields).ego.tracker_version == 2
     del fields["ego"]["tracker_version"]
     assert stored_spec(fields).ego.tracker_version == 1
 
 
-def test_a_vehicle_beside_its_plan_comes_back_to_it(make_world):
+def test_a_vehicle_beside_its_plan_returns_to_it(make_world):
     world = make_world()
     plan = TrajectoryPlan(
         times_us=[world.t_us + 100_000 * i for i in range(1, 120)],
@@ -198,7 +197,7 @@ def test_a_vehicle_beside_its_plan_comes_back_to_it(make_world):
     assert world.motion.speed == pytest.approx(10.0, abs=0.05)
 
 
-def test_after_its_end_a_plan_ends_in_a_gentle_stop(make_world):
+def test_the_vehicle_stops_gently_after_the_end_of_a_plan(make_world):
     world = make_world(spec={"ego": IDEAL})
     plan = TrajectoryPlan(times_us=[world.t_us + 500_000], poses=[(5.0, 0.0, 0.0)])
     world.step(plan)
@@ -212,7 +211,7 @@ def test_after_its_end_a_plan_ends_in_a_gentle_stop(make_world):
     assert abs(world.motion.y) < 1e-6
 
 
-def test_a_plan_that_stands_still_close_ahead_is_an_emergency_stop(make_world):
+def test_a_standing_plan_close_ahead_is_an_emergency_stop(make_world):
     world = make_world(spec={"ego": IDEAL})
     stop = TrajectoryPlan(
         times_us=[world.t_us + 500_000 * i for i in range(1, 9)],
@@ -226,7 +225,7 @@ def test_a_plan_that_stands_still_close_ahead_is_an_emergency_stop(make_world):
     assert world.motion.x == pytest.approx(10.0**2 / (2 * 8.0), abs=0.5)
 
 
-def test_limits_hold_for_plans_no_vehicle_could_follow(make_world):
+def test_limits_hold_for_infeasible_plans(make_world):
     world = make_world()
     before = world.motion
     for _ in range(20):

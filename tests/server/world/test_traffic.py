@@ -1,4 +1,4 @@
-"""Drivers of other road users: one contract for all, and what each is for."""
+"""Drivers of other road users: the common contract and each driver's behaviour."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def agent_of(world, object_id: str = "car") -> dict:
 
 @pytest.fixture
 def driven(make_world, moving):
-    """A world in which ``car``, 30 m ahead at 6 m/s, has a driver of a kind."""
+    """Make a world with a driver of a kind for ``car``, 30 m ahead at 6 m/s."""
 
     def make(kind: str, *, spec: dict | None = None, car=None, **fields):
         agents = {"drivers": {"car": {"kind": kind, **fields}}}
@@ -43,11 +43,11 @@ def driven(make_world, moving):
     return make
 
 
-# --- the contract of all ----------------------------------------------------------------------
+# --- the common contract ----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_velocity_is_how_the_place_changes(driven, kind):
+def test_velocity_matches_the_displacement(driven, kind):
     world = driven(kind, spec={"on_collision": "continue"})
     before = agent_of(world)["position"]
     for _ in range(12):
@@ -69,7 +69,7 @@ def test_quaternions_are_unit_and_boxes_keep_their_size(driven, kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_copy_of_the_world_goes_on_alike_and_alone(driven, kind):
+def test_a_fork_evolves_identically_and_independently(driven, kind):
     world = driven(kind)
     for _ in range(3):
         world.step(COAST)
@@ -82,7 +82,7 @@ def test_a_copy_of_the_world_goes_on_alike_and_alone(driven, kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_drivers_may_be_deleted(driven, kind):
+def test_driven_objects_can_be_deleted(driven, kind):
     world = driven(kind)
     world.step(COAST)
     world.apply([Delete(object_id="car")])
@@ -91,7 +91,7 @@ def test_drivers_may_be_deleted(driven, kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_an_edit_of_its_trajectory_is_where_a_driver_begins_anew(driven, kind):
+def test_a_driver_restarts_from_an_edited_trajectory(driven, kind):
     if kind in {"cut_in", "junction_crossing"}:
         pytest.skip("these take their places from the ego's route")
     world = driven(kind)
@@ -101,7 +101,7 @@ def test_an_edit_of_its_trajectory_is_where_a_driver_begins_anew(driven, kind):
     assert agent_of(world)["position"][1] - before == pytest.approx(2.5, abs=0.05)
 
 
-def test_a_driver_of_nobody_is_refused(make_world, moving):
+def test_a_driver_of_an_unknown_object_is_refused(make_world, moving):
     with pytest.raises(WorldError, match="'ghost', which is not an object") as refused:
         make_world(car=moving(30, 5), spec={"agents": {"drivers": {"ghost": {"kind": "idm"}}}})
     assert refused.value.code == ErrorCode.UNKNOWN_OBJECT
@@ -110,7 +110,7 @@ def test_a_driver_of_nobody_is_refused(make_world, moving):
 # --- constant velocity, IDM -------------------------------------------------------------------
 
 
-def test_constant_velocity_ignores_the_bend_of_the_recording(make_world, moving):
+def test_constant_velocity_drives_straight(make_world, moving):
     car = moving(20, 8, z=0.8, speed=4.0, yaw=0.3)
     agents = {"default": "constant_velocity"}
     world = make_world(car=car, spec=CONTROL | {"agents": agents})
@@ -135,7 +135,7 @@ def test_idm_reaches_its_desired_speed_on_a_free_road(make_world, moving):
     assert max(np.diff(speeds)) <= 0.15 + 1e-6
 
 
-def test_idm_that_wants_to_stand_comes_to_a_stop(make_world, moving):
+def test_idm_with_zero_desired_speed_stops(make_world, moving):
     agents = {"drivers": {"car": {"kind": "idm", "desired_speed": 0.0}}}
     world = make_world(car=moving(30, 20, z=0.8, speed=6.0), spec=CONTROL | {"agents": agents})
     for _ in range(40):
@@ -177,7 +177,7 @@ def test_replayed_traffic_runs_into_an_ego_that_stops(make_world, moving):
     assert world.accumulator.at_fault == {}
 
 
-def test_replayed_traffic_reacts_once_the_ego_leaves_the_log_where_asked(make_world, moving):
+def test_replayed_traffic_can_react_once_the_ego_leaves_the_log(make_world, moving):
     agents = {"ego_off_log": "idm", "off_log_distance": 2.0}
     world = make_world(car=moving(-25, 0, z=0.8, speed=10.0), spec=CONTROL | {"agents": agents})
     events = []
@@ -190,7 +190,7 @@ def test_replayed_traffic_reacts_once_the_ego_leaves_the_log_where_asked(make_wo
 # --- adversaries ------------------------------------------------------------------------------
 
 
-def test_a_cut_in_ends_in_the_egos_lane_ahead_of_it(driven):
+def test_a_cut_in_ends_ahead_in_the_egos_lane(driven):
     world = driven("cut_in", gap=8.0, speed_change=0.0)
     assert agent_of(world)["position"][1] == pytest.approx(3.5)
     for _ in range(40):
@@ -200,7 +200,7 @@ def test_a_cut_in_ends_in_the_egos_lane_ahead_of_it(driven):
     assert x - 2.0 - (world.motion.x + 3.65) == pytest.approx(8.0, abs=1.0)
 
 
-def test_a_cut_in_that_brakes_is_hit_by_an_ego_that_does_not(driven):
+def test_an_ego_that_does_not_brake_hits_a_braking_cut_in(driven):
     world = driven("cut_in", gap=4.0, speed_change=-6.0)
     while not world.over:
         world.step(COAST)
@@ -225,7 +225,7 @@ def test_a_hard_brake_needs_the_ego_near(driven):
 
 
 @pytest.mark.parametrize("angle", [1.57, -1.57])
-def test_a_crossing_meets_an_ego_that_does_not_react(driven, angle):
+def test_a_crossing_car_hits_an_ego_that_does_not_react(driven, angle):
     world = driven("junction_crossing", ahead=40.0, angle=angle)
     while not world.over:
         world.step(COAST)
@@ -233,7 +233,7 @@ def test_a_crossing_meets_an_ego_that_does_not_react(driven, angle):
     assert world.motion.x == pytest.approx(40.0 - 3.65, abs=2.5)
 
 
-def test_a_crossing_is_missed_by_an_ego_that_brakes_late_and_hard(driven):
+def test_an_ego_that_brakes_late_and_hard_avoids_a_crossing_car(driven):
     world = driven("junction_crossing", ahead=40.0, commit=2.0)
     while not world.over:
         near = world.motion.x > 20.0
@@ -244,7 +244,7 @@ def test_a_crossing_is_missed_by_an_ego_that_brakes_late_and_hard(driven):
 # --- external ---------------------------------------------------------------------------------
 
 
-def test_an_external_agent_follows_its_plan_and_then_goes_straight_on(driven):
+def test_an_external_agent_follows_its_plan_then_drives_straight(driven):
     world = driven("external")
     times = [world.t_us + 500_000, world.t_us + 1_000_000]
     world.set_agent_plan("car", times, [(33.0, 1.0, 0.0), (37.0, 2.0, 0.0)])
@@ -268,7 +268,7 @@ def test_plans_for_the_past_are_refused(driven):
         world.set_agent_plan("car", [world.t_us], [(0.0, 0.0, 0.0)])
 
 
-def test_a_pose_driven_ego_is_seen_by_idm(make_world, moving):
+def test_idm_reacts_to_a_pose_driven_ego(make_world, moving):
     world = make_world(
         moving(speed=5.0),
         car=moving(-12, 0, z=0.8, speed=6.0),

@@ -1,4 +1,4 @@
-"""TLC: stop lines that are crossed while their signal is red."""
+"""Traffic light compliance (TLC): stop lines crossed on red."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from .scored_drives import context, drive
 from .test_map_scores import street
 
 WAY = [10.0] * 41
-"""The front begins 3.65 m ahead of x = 0, and is at 43.65 m in the end."""
+"""Speeds [m/s]. The front bumper moves from x = 3.65 to 43.65 m."""
 AT = 20.0
-"""Where vehicles stop: passed between steps 16 and 17."""
+"""Position of the stop line [m], crossed between steps 16 and 17."""
 
 
 def judged(instants, given=None):
@@ -35,7 +35,7 @@ def judged(instants, given=None):
 
 
 def with_signal(states, *, line=(AT, 0.0, 0.0), y=0.0, name="s"):
-    """Instants of a drive along y by a signal; ``states`` gives what it shows by step."""
+    """Instants of a drive at offset y past a signal with ``states(step)``."""
     instants = drive(WAY, y=y)
     return [replace(i, signals=(ShownSignal(name, states(i.step), line),)) for i in instants]
 
@@ -47,11 +47,11 @@ def always(state):
 @pytest.mark.parametrize(
     ("state", "compliance"), [("red", 0.0), ("green", 1.0), ("amber", 1.0), ("off", 1.0)]
 )
-def test_a_stop_line_is_crossed_on_red_alone(state, compliance):
+def test_only_red_forbids_crossing_a_stop_line(state, compliance):
     assert light_compliance(judged(with_signal(always(state)))) == compliance
 
 
-def test_what_counts_is_what_the_signal_shows_when_the_front_crosses():
+def test_the_state_counts_when_the_front_crosses():
     turns = {
         at: judged(with_signal(lambda k, at=at: "red" if k < at else "green")) for at in (16, 18)
     }
@@ -59,7 +59,7 @@ def test_what_counts_is_what_the_signal_shows_when_the_front_crosses():
     assert light_compliance(turns[18]) == 0.0
 
 
-def test_a_step_in_which_the_signal_changes_is_not_held_against_the_ego():
+def test_crossing_while_the_signal_changes_is_compliant():
     for before, after in (("red", "green"), ("green", "red")):
         changing = judged(with_signal(lambda k, a=before, b=after: a if k < 17 else b))
         assert light_compliance(changing) == 1.0
@@ -75,7 +75,7 @@ def test_a_step_in_which_the_signal_changes_is_not_held_against_the_ego():
         ((2.0, 0.0, 0.0), 0.0),  # behind the front from the start
     ],
 )
-def test_lines_of_others_are_not_run(line, y):
+def test_stop_lines_of_others_do_not_count(line, y):
     assert light_compliance(judged(with_signal(always("red"), line=line, y=y))) == 1.0
 
 
@@ -95,7 +95,7 @@ def test_lines_of_others_are_not_run(line, y):
         ("coloured", False),
     ],
 )
-def test_states_that_are_red(state, red):
+def test_shows_red_recognises_red_states(state, red):
     assert shows_red(state) is red
 
 
@@ -106,7 +106,7 @@ def mapped(**parts) -> RoadMap:
 
 
 @pytest.mark.parametrize("parts", [{"stop_line": "l"}, {"stop_line": "l", "lanes": ("own",)}])
-def test_a_signal_of_the_map_is_obeyed_at_the_stop_line_of_the_map(parts):
+def test_a_map_signal_applies_at_the_map_stop_line(parts):
     given = context(40, road_map=mapped(**parts))
     instants = with_signal(always("red"), line=None)
     assert light_compliance(judged(instants, given)) == 0.0
@@ -114,13 +114,13 @@ def test_a_signal_of_the_map_is_obeyed_at_the_stop_line_of_the_map(parts):
     assert light_compliance(judged(beside, given)) == 1.0
 
 
-def test_a_signal_of_lanes_without_a_stop_line_is_obeyed_at_their_ends():
+def test_a_signal_without_a_stop_line_applies_at_the_lane_end():
     far = context(40, road_map=mapped(lanes=("own",)))
     assert judged(with_signal(always("red"), line=None), far).lights.placed == {"s"}
     assert light_compliance(judged(with_signal(always("red"), line=None), far)) == 1.0
 
 
-def test_what_is_assumed_says_which_signals_counted():
+def test_assumptions_name_the_signals_that_counted():
     plain, on_map = context(40), context(40, road_map=mapped(stop_line="l"))
     assert lights(judged(drive(WAY)), plain) == "TLC: no traffic lights"
     assert "show no phases" in lights(judged(drive(WAY), on_map), on_map)
@@ -132,14 +132,14 @@ def test_what_is_assumed_says_which_signals_counted():
     assert "others of the map show no phases" in lights(judged(other, on_map), on_map)
 
 
-def test_scores_that_do_not_look_at_lights_say_what_was_run():
+def test_scores_without_traffic_lights_name_the_violations():
     given = context(40)
     found = {s.name: s for s in scoring.scores_of(judged(with_signal(always("red"))), given)}
     assert "stop lines crossed on red (1)" in found["pdms"].cannot_see
     assert "traffic lights" not in found["epdms"].cannot_see
 
 
-def test_a_recording_keeps_what_signals_showed_and_nothing_where_there_are_none():
+def test_signals_round_trip_in_recordings():
     with_one = with_signal(always("red;amber"))[3]
     again, _ = read_instant(instant_row(with_one, "d"))
     assert again.signals == with_one.signals
@@ -149,7 +149,7 @@ def test_a_recording_keeps_what_signals_showed_and_nothing_where_there_are_none(
 
 
 @pytest.mark.parametrize("wrong", [["s", "red"], ["s", 3, None], ["s", "red", [1.0, 2.0]]])
-def test_a_recording_of_no_signals_is_refused(wrong):
+def test_malformed_signals_in_a_recording_are_refused(wrong):
     row = instant_row(with_signal(always("red"))[0], "d") | {"signals": [wrong]}
     with pytest.raises((ValueError, TypeError)):
         read_instant(row)

@@ -1,4 +1,4 @@
-"""The vehicle models against textbook cases."""
+"""Vehicle models against textbook cases."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ DYNAMIC = EgoSpec(dynamics="dynamic_bicycle")
 
 
 def driven(spec: EgoSpec, motion: Motion, seconds: float, driver) -> list[Motion]:
-    """Motions every 100 ms; the driver looks every 10 ms."""
+    """Motions every 100 ms, with commands updated every 10 ms."""
     motions = []
     for _ in range(round(seconds * 10)):
         for _ in range(10):
@@ -34,7 +34,7 @@ def driven(spec: EgoSpec, motion: Motion, seconds: float, driver) -> list[Motion
 
 
 def cornering(spec: EgoSpec, speed: float, steering: float) -> Motion:
-    """Steady state at a speed that the driver keeps."""
+    """Steady-state cornering at constant speed."""
 
     def keep(motion: Motion) -> Command:
         return Command(5.0 * (speed - motion.speed), steering)
@@ -59,7 +59,7 @@ def test_the_understeer_gradient_is_that_of_a_mid_size_car():
     assert degrees_per_g == pytest.approx(1.16, abs=0.01)
 
 
-def test_equal_tyres_steer_neutrally():
+def test_equal_tyres_give_neutral_steering():
     spec = EgoSpec(
         dynamics="dynamic_bicycle", vehicle={"front_cornering": 12.0, "rear_cornering": 12.0}
     )
@@ -68,7 +68,7 @@ def test_equal_tyres_steer_neutrally():
     assert slow.speed / slow.yaw_rate == pytest.approx(fast.speed / fast.yaw_rate, rel=0.03)
 
 
-def test_oversteer_loses_the_car_above_its_critical_speed():
+def test_an_oversteering_car_is_unstable_above_its_critical_speed():
     # v_crit = sqrt(-L/K) (Gillespie 1992, eq. 6-16).
     spec = EgoSpec(
         dynamics="dynamic_bicycle", vehicle={"front_cornering": 15.0, "rear_cornering": 9.0}
@@ -86,14 +86,14 @@ def test_oversteer_loses_the_car_above_its_critical_speed():
     assert yaw_after(1.3 * critical) > 0.05
 
 
-def test_lateral_acceleration_ends_at_the_friction_limit():
+def test_lateral_acceleration_is_limited_by_friction():
     motion = cornering(DYNAMIC, 25.0, 0.3)
 
     assert abs(motion.speed * motion.yaw_rate) < 1.05 * 0.9 * GRAVITY
 
 
 @pytest.mark.parametrize(("friction", "expected"), [(0.9, 8.0), (0.5, 0.5 * GRAVITY)])
-def test_braking_distance_is_that_of_brakes_or_of_friction(friction, expected):
+def test_braking_distance_is_limited_by_brakes_or_friction(friction, expected):
     spec = EgoSpec(dynamics="dynamic_bicycle", vehicle={"friction": friction}, actuators=IDEAL)
     motions = driven(spec, Motion(0, 0, 0, 20.0), 6.0, lambda _m: Command(-50.0, 0.0))
 
@@ -101,7 +101,7 @@ def test_braking_distance_is_that_of_brakes_or_of_friction(friction, expected):
     assert motions[-1].x == pytest.approx(20.0**2 / (2 * expected), rel=0.01)
 
 
-def test_slow_dynamic_cars_are_kinematic_ones():
+def test_the_dynamic_model_is_kinematic_at_low_speed():
     kinematic = driven(EgoSpec(), Motion(0, 0, 0, 1.5), 5.0, lambda _m: Command(0.0, 0.3))
     dynamic = driven(DYNAMIC, Motion(0, 0, 0, 1.5), 5.0, lambda _m: Command(0.0, 0.3))
 
@@ -115,7 +115,7 @@ def test_the_model_is_smooth_through_walking_pace():
     assert np.abs(np.diff(rates)).max() < 0.05
 
 
-def test_a_tyre_is_linear_for_small_slip_and_slides_at_its_limit():
+def test_a_tyre_is_linear_at_small_slip_and_saturates():
     assert fiala(1e-4, 50e3, 4e3) == pytest.approx(5.0, rel=1e-3)
     assert fiala(0.5, 50e3, 4e3) == 4e3
     assert fiala(-0.5, 50e3, 4e3) == -4e3
@@ -125,7 +125,7 @@ def test_a_tyre_is_linear_for_small_slip_and_slides_at_its_limit():
     assert fiala(edge - 1e-4, 50e3, 4e3) == pytest.approx(4e3, rel=1e-5)
 
 
-def test_braking_in_a_bend_takes_cornering_force():
+def test_braking_in_a_bend_reduces_cornering_force():
     vehicle = vehicle_parameters(DYNAMIC)
     free, braked = (
         axle_forces(vehicle, (20.0, 0.0, 0.0), steering=0.2, acceleration=a) for a in (0.0, -8.0)
@@ -147,7 +147,7 @@ def test_a_delayed_brake_acts_after_its_dead_time():
     assert motions[-1].speed == pytest.approx(10.0 - 4.0 * 0.75)
 
 
-def test_a_lagging_steering_gear_approaches_its_command():
+def test_steering_lag_is_first_order():
     spec = EgoSpec(actuators={"steering_lag": 0.2}, max_steer_rate=10.0)
     motions = driven(spec, Motion(0, 0, 0, 5.0), 0.4, lambda _m: Command(0.0, 0.1))
 
@@ -159,7 +159,7 @@ def test_a_lagging_steering_gear_approaches_its_command():
 
 
 def lane_change(speed: float) -> tuple[list[int], list[tuple[float, float, float]]]:
-    """3.5 m to the left in 60 m, as smoothly as a fifth-order polynomial."""
+    """A lane change of 3.5 m to the left over 60 m, a quintic polynomial."""
     times, poses = [], []
     for k in range(1, 81):
         x = speed * k * 0.1
@@ -197,13 +197,13 @@ TRACKERS = ["pursuit", "lqr", "ilqr"]
 @pytest.mark.parametrize(
     ("tracker", "tolerance"), [*((t, 0.2) for t in TRACKERS), ("perfect", 1e-3)]
 )
-def test_a_lane_change_at_15_metres_a_second_is_tracked(dynamics, tracker, actuators, tolerance):
+def test_a_lane_change_at_15_metres_per_second_is_tracked(dynamics, tracker, actuators, tolerance):
     spec = EgoSpec(dynamics=dynamics, tracker=tracker, actuators=actuators)
 
     assert worst_offset(spec, 15.0) < tolerance
 
 
-def test_actuators_lag_like_nuplans_unless_told_otherwise():
+def test_default_actuators_lag_like_nuplan():
     # KinematicBicycleModel: accel_time_constant 0.2 s, steering_angle_time_constant 0.05 s.
     assert EgoSpec() == EgoSpec(actuators=NUPLAN)
 
@@ -221,7 +221,7 @@ def test_actuators_lag_like_nuplans_unless_told_otherwise():
     ],
 )
 @pytest.mark.parametrize("radius", [math.inf, 60.0])
-def test_slow_actuators_leave_trackers_stable(dynamics, tracker, actuators, radius):
+def test_trackers_are_stable_with_slow_actuators(dynamics, tracker, actuators, radius):
     spec = EgoSpec(dynamics=dynamics, tracker=tracker, actuators=actuators)
     speed, times = 12.0, [k * 100_000 for k in range(1, 101)]
     turns = [speed * t * 1e-6 / radius for t in times]
@@ -244,7 +244,7 @@ def test_slow_actuators_leave_trackers_stable(dynamics, tracker, actuators, radi
     assert max(offsets[-20:]) < 0.13
 
 
-def test_trackers_that_do_not_foresee_drive_as_if_actuators_were_ideal():
+def test_trackers_without_foresight_assume_ideal_actuators():
     slow = {**NUPLAN, **DELAYED, "foreseen": False}
     motion, commands = Motion(0, 0.5, 0, 12.0), []
     for actuators in (slow, IDEAL):
@@ -256,8 +256,8 @@ def test_trackers_that_do_not_foresee_drive_as_if_actuators_were_ideal():
     assert commands[0] == commands[1]
 
 
-def test_a_plan_is_not_over_while_its_last_commands_are_on_their_way():
-    # A single pose, a dead time ahead: without that the vehicle would brake all the time.
+def test_a_plan_lasts_until_its_delayed_commands_act():
+    # A single pose one dead time ahead. Otherwise the vehicle would brake at every step.
     spec = EgoSpec(tracker="lqr", actuators={**IDEAL, **DELAYED})
     motion = Motion(0, 0, 0, 10.0)
     for k in range(30):
@@ -271,7 +271,7 @@ def test_a_plan_is_not_over_while_its_last_commands_are_on_their_way():
 
 
 @pytest.mark.parametrize("lag", [0.01, 0.1, 0.333, 1.0, 3.6])
-def test_gains_of_a_lagging_regulator_are_those_of_the_riccati_equation(lag):
+def test_gains_with_lag_solve_the_riccati_equation(lag):
     A = np.array([[0.0, 1, 0], [0, 0, 1], [0, 0, -1 / lag]])
     B = np.array([[0.0], [0], [1 / lag]])
     P = solve_continuous_are(A, B, np.diag([1.0, 0, 0]), np.eye(1))
@@ -280,7 +280,7 @@ def test_gains_of_a_lagging_regulator_are_those_of_the_riccati_equation(lag):
     np.testing.assert_allclose((1.0, *lagging_gains(lag)), expected, rtol=1e-6)
 
 
-def test_without_a_lag_the_gains_are_those_of_two_integrators():
+def test_gains_without_lag_are_those_of_a_double_integrator():
     assert lagging_gains(0.0) == (math.sqrt(2.0), 0.0)
     np.testing.assert_allclose(lagging_gains(1e-6), (math.sqrt(2.0), 0.0), atol=1e-5)
 
@@ -298,7 +298,7 @@ def test_every_tracker_drives_an_episode(make_world, tracker):
 
 
 @pytest.mark.parametrize("tracker", ["lqr", "ilqr"])
-def test_trackers_obey_the_limits_of_the_vehicle(tracker):
+def test_trackers_obey_vehicle_limits(tracker):
     spec = EgoSpec(tracker=tracker)
     motion = Motion(0, 0, 0, 10.0)
     reference = ReferenceTrajectory(

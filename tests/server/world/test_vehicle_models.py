@@ -1,4 +1,4 @@
-"""The contract of vehicle models, for all members of the family and for one made here."""
+"""The contract of vehicle models, for all built-in models and a custom one."""
 
 import math
 
@@ -21,7 +21,7 @@ DRAG = 0.1
 
 @func
 def step_dragged(state, command, vehicle, h):
-    """A kinematic bicycle that the air slows down."""
+    """A kinematic bicycle with air drag."""
     slowed = command.acceleration - DRAG * state.speed
     return step_rolling(state, Command(slowed, command.steering), vehicle, h)
 
@@ -50,34 +50,34 @@ def at_speed(speed: float, steering: float = 0.0) -> PlanarState:
     return PlanarState(0.0, 0.0, 0.0, speed, 0.0, steering, 0.0, 0.0, 0.0)
 
 
-def test_a_step_returns_a_state_of_finite_numbers(model):
+def test_a_step_returns_a_finite_state(model):
     state = drive(model, at_speed(8.0), Command(1.0, 0.1), 5)
 
     assert isinstance(state, PlanarState)
     assert all(math.isfinite(v) for v in state)
 
 
-def test_wheels_that_point_ahead_keep_the_vehicle_on_its_line(model):
+def test_zero_steering_keeps_the_vehicle_straight(model):
     state = drive(model, at_speed(8.0), Command(0.0, 0.0), 100)
 
     assert state.x > 5.0
     assert (state.y, state.yaw, state.yaw_rate) == pytest.approx((0.0, 0.0, 0.0), abs=1e-9)
 
 
-def test_braking_ends_at_rest_and_never_in_reversing(model):
+def test_braking_ends_at_rest(model):
     state = drive(model, at_speed(5.0), Command(-6.0, 0.0), 200)
 
     assert state.speed == 0.0
 
 
-def test_left_and_right_are_alike(model):
+def test_left_and_right_are_symmetric(model):
     left = drive(model, at_speed(8.0), Command(0.5, 0.1), 50)
     right = drive(model, at_speed(8.0), Command(0.5, -0.1), 50)
 
     assert (left.x, left.y, left.yaw) == pytest.approx((right.x, -right.y, -right.yaw), abs=1e-9)
 
 
-def test_limits_of_the_vehicle_hold(model):
+def test_vehicle_limits_hold(model):
     vehicle = parameters(model)
     state = drive(model, at_speed(vehicle.max_speed - 0.01), Command(100.0, 10.0), 10)
 
@@ -85,11 +85,11 @@ def test_limits_of_the_vehicle_hold(model):
     assert abs(state.steering) <= vehicle.max_steer_rate * 10 * H + 1e-12
 
 
-def test_steady_steering_keeps_the_curvature_that_a_tracker_wants(model):
+def test_steady_steering_keeps_the_requested_curvature(model):
     vehicle, curvature, speed = parameters(model), 0.01, 10.0
     rolling = math.atan(vehicle.wheelbase * curvature)
     steering = model.steady_steering(rolling, curvature, speed, vehicle)
-    # The command holds the speed, whatever resists.
+    # The command holds the speed against drag.
     state = at_speed(speed, steering)
     for _ in range(300):
         state = model.step(state, Command(speed - state.speed, steering), vehicle, H)
@@ -97,7 +97,7 @@ def test_steady_steering_keeps_the_curvature_that_a_tracker_wants(model):
     assert state.yaw_rate / state.speed == pytest.approx(curvature, rel=0.05)
 
 
-def test_compiled_code_chooses_a_model_by_its_place_in_the_table():
+def test_compiled_code_selects_a_model_by_index():
     step = choice([model.step for model in MEMBERS.values()])
     coast, start = Command(0.0, 0.0), at_speed(10.0)
     vehicle = vehicle_parameters(EgoSpec())
@@ -106,5 +106,5 @@ def test_compiled_code_chooses_a_model_by_its_place_in_the_table():
     assert speeds == pytest.approx([10.0, 10.0, 10.0 * (1 - DRAG * H)])
 
 
-def test_the_dynamics_of_the_wire_are_the_members_of_the_family():
+def test_protocol_dynamics_match_the_registry():
     assert EgoSpec.model_json_schema()["properties"]["dynamics"]["enum"] == list(VEHICLE_MODELS)

@@ -1,4 +1,4 @@
-"""The newest entries of a growing sequence, shared by those who go on from it."""
+"""Windows of the newest entries, with storage shared between branches."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def test_the_last_entries_are_kept() -> None:
     assert window.newest(3) == 46
 
 
-def test_windows_that_part_do_not_see_each_other() -> None:
+def test_branched_windows_are_independent() -> None:
     start = Window(1, 2)
     one, other = start.pushed(3, 8), start.pushed(4, 8)
     assert (list(start), list(one), list(other)) == ([1, 2], [1, 2, 3], [1, 2, 4])
@@ -26,14 +26,14 @@ def test_windows_that_part_do_not_see_each_other() -> None:
     assert list(other.pushed(6, 3)) == [2, 4, 6]
 
 
-def test_all_entries_can_be_changed() -> None:
+def test_mapped_changes_every_entry() -> None:
     window = Window(1, 2)
     assert list(window.mapped(lambda k: 10 * k)) == [10, 20]
     assert list(window) == [1, 2]
 
 
 @pytest.mark.parametrize("most", [1, 4, 20])
-def test_the_last_rows_are_one_array(most: int) -> None:
+def test_the_last_rows_form_one_contiguous_array(most: int) -> None:
     window, rows = RowWindow(np.zeros((0, 2))), np.arange(100.0).reshape(50, 2)
     for k, row in enumerate(rows.tolist()):
         window = window.pushed(row, most)
@@ -41,7 +41,7 @@ def test_the_last_rows_are_one_array(most: int) -> None:
         assert window.rows.flags.c_contiguous
 
 
-def test_windows_of_rows_that_part_do_not_see_each_other() -> None:
+def test_branched_row_windows_are_independent() -> None:
     start = RowWindow(np.zeros((0, 1))).pushed((1.0,), 8)
     one, other = start.pushed((2.0,), 8), start.pushed((3.0,), 8)
     assert [w.rows.ravel().tolist() for w in (start, one, other)] == [[1], [1, 2], [1, 3]]

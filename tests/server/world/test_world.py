@@ -19,7 +19,7 @@ def observed(world: World) -> bytes:
     return encode(world.observe().obs_fields())
 
 
-def test_an_episode_begins_as_recorded(make_world):
+def test_an_episode_starts_at_the_recorded_state(make_world):
     world = make_world(spec={"start_us": 6_000_000})
 
     assert (world.steps, world.t_us, world.over) == (0, 6_000_000, False)
@@ -56,7 +56,7 @@ def test_agents_move_as_recorded(make_world, moving):
 
 
 @pytest.mark.parametrize("yaw", [0.0, 1.0, 3.1, -2.5])
-def test_the_ego_quaternion_is_its_pose(make_world, moving, yaw):
+def test_the_ego_quaternion_matches_its_pose(make_world, moving, yaw):
     world = make_world(moving(speed=5.0, yaw=yaw))
     w, x, y, z = world.observe().ego_fields()["quaternion"]
 
@@ -64,7 +64,7 @@ def test_the_ego_quaternion_is_its_pose(make_world, moving, yaw):
     assert np.exp(1j * yaw) == pytest.approx((w + 1j * z) ** 2)
 
 
-def test_control_is_direct_actuation(make_world):
+def test_control_actuates_directly(make_world):
     ideal = {"actuators": {"steering_lag": 0.0, "drive_lag": 0.0}}
     world = make_world(spec={**CONTROL, "ego": ideal})
     for _ in range(10):
@@ -97,7 +97,7 @@ def test_no_plan_keeps_the_last_one(make_world):
 
 
 @pytest.mark.parametrize("action", ["trajectory", "control", "pose"])
-def test_before_any_plan_the_log_is_followed(make_world, action):
+def test_the_log_is_followed_before_the_first_plan(make_world, action):
     world = make_world(spec={"action": action})
     for _ in range(10):
         world.step()
@@ -137,7 +137,7 @@ def test_the_episode_ends_at_the_end_of_the_log(make_world):
     assert [e.type for e in events] == ["horizon"]
 
 
-def test_a_shorter_horizon_ends_earlier(make_world):
+def test_an_episode_ends_at_its_horizon(make_world):
     world = make_world(spec={"horizon": 3})
     for _ in range(3):
         world.step()
@@ -145,7 +145,7 @@ def test_a_shorter_horizon_ends_earlier(make_world):
     assert world.truncated
 
 
-def test_no_step_after_the_end(make_world):
+def test_stepping_a_finished_episode_is_refused(make_world):
     world = make_world(spec={"horizon": 1})
     world.step()
 
@@ -202,7 +202,7 @@ def test_metrics_measure_the_drive(make_world):
     assert {name: found[name] for name in expected} == pytest.approx(expected)
 
 
-def test_leaving_the_recorded_path_is_an_event_once(make_world):
+def test_leaving_the_recorded_path_is_reported_once(make_world):
     world = make_world(spec=POSE)
     ys = [9.0, 11.0, 12.0, 5.0, -15.0]
     events = [
@@ -213,7 +213,7 @@ def test_leaving_the_recorded_path_is_an_event_once(make_world):
     assert events == [[], ["left_log"], [], [], ["left_log"]]
 
 
-def test_whoever_drives_on_past_the_end_of_the_log_keeps_its_lane(make_world):
+def test_driving_past_the_end_of_the_log_stays_in_lane(make_world):
     world = make_world(spec=POSE)
     events = [e.type for k in range(40) for e in world.step(PoseCommand(x=3.5 * k, y=0.3, yaw=0))]
 
@@ -223,7 +223,7 @@ def test_whoever_drives_on_past_the_end_of_the_log_keeps_its_lane(make_world):
     assert not world.accumulator.left_lane
 
 
-def test_an_edit_shows_at_once_and_is_an_event_of_the_next_step(make_world, moving):
+def test_an_edit_shows_at_once_and_is_reported_at_the_next_step(make_world, moving):
     world = make_world(car=moving(30, 5), spec={"privileged": True})
     outcome = world.apply([Translate(object_id="car", y=3), Duplicate(object_id="car", x=20)])
 
@@ -256,7 +256,7 @@ def test_an_edit_for_another_revision_is_refused(make_world, moving):
     assert refused.value.code == ErrorCode.STALE_REVISION
 
 
-def test_the_scene_and_the_scenario_are_left_alone(make_scene, moving):
+def test_an_edit_does_not_affect_other_worlds_of_the_scene(make_scene, moving):
     scene = make_scene(car=moving(30, 5))
     state = ScenarioState.of(scene)
     first, second = (World(scene, state, ResetSpec(privileged=True)) for _ in range(2))
@@ -268,7 +268,7 @@ def test_the_scene_and_the_scenario_are_left_alone(make_scene, moving):
 
 
 def drive_somewhere(world: World) -> list[bytes]:
-    """An episode with everything in it: plans, an edit, a contact."""
+    """An episode with plans, an edit and a contact."""
     seen = []
     for k in range(30):
         times = [world.t_us + 200_000 * (i + 1) for i in range(5)]
@@ -280,14 +280,14 @@ def drive_somewhere(world: World) -> list[bytes]:
     return seen
 
 
-def test_same_actions_give_the_same_bits(make_world, moving):
+def test_equal_actions_give_equal_results(make_world, moving):
     spec = {"seed": 3, "privileged": True, "on_collision": "continue"}
     first, second = (make_world(car=moving(30, 5, speed=2.0), spec=spec) for _ in range(2))
 
     assert drive_somewhere(first) == drive_somewhere(second)
 
 
-def test_a_step_can_be_drawn_before_it_is_evaluated(make_world, moving):
+def test_a_step_can_be_rendered_before_it_is_evaluated(make_world, moving):
     def drawn(world: World) -> bytes:
         poses = [i.T_world_object for i in world.instances()[1:]]
         return encode({"ego": world.T_world_vehicle, "objects": poses, "t_us": world.t_us})
@@ -314,7 +314,7 @@ def test_evaluating_again_changes_nothing(make_world):
     assert observed(world) == before
 
 
-def test_a_copy_goes_on_alike_and_on_its_own(make_world, moving):
+def test_a_fork_continues_identically_and_independently(make_world, moving):
     spec = {"privileged": True, "on_collision": "continue"}
     world = make_world(car=moving(60, 5, speed=2.0), spec=spec)
     world.step(TrajectoryPlan(times_us=[world.t_us + 2_000_000], poses=[(20, 3, 0)]))

@@ -1,4 +1,4 @@
-"""Argoverse 2 sensor log: frames start at a turn's start, images come when they like."""
+"""Argoverse 2 sensor log: frames start with a LiDAR revolution, images are asynchronous."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def write(log: DrivingLog, folder: Path) -> None:
     _write_calibration(log, folder / "calibration", down)
     for name, camera in NAMES.items():
         for frame, ns in enumerate(stamps):
-            # The images of the log are of frame time; real ones are a little off.
+            # These images have the frame time; real ones deviate slightly.
             path = folder / "sensors/cameras" / camera / f"{ns}.jpg"
             path.parent.mkdir(parents=True, exist_ok=True)
             write_image(path, log.image(name, frame))

@@ -1,4 +1,4 @@
-"""The preprocessed folder of drivestudio, of a Waymo segment."""
+"""The preprocessed drivestudio folder of a Waymo segment."""
 
 from __future__ import annotations
 

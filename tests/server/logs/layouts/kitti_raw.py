@@ -1,4 +1,4 @@
-"""A drive of the KITTI raw data, made of the tracking layout of the same log."""
+"""A KITTI raw drive, derived from the tracking layout of the same log."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from real2sim_server.logs.readers.kitti_tracking import EARTH_RADIUS
 DAY, DRIVE = "2011_09_26", "2011_09_26_drive_0042_sync"
 LATITUDE, LONGITUDE, COURSE = 49.0, 8.4, 0.7
 UNIT_LEFT = 0.32
-"""The GPS/IMU unit sits this far left of the vehicle's middle [m]."""
+"""Offset of the GPS/IMU unit to the left of the vehicle's centre line [m]."""
 
 
 def write(log: DrivingLog, tracking: Path, folder: Path) -> None:

@@ -1,4 +1,4 @@
-"""nuScenes: tables of rows with tokens, far from the origin of its map, boxes in every frame."""
+"""nuScenes: token tables, far from the map origin, with boxes in every frame."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def write(log: DrivingLog, root: Path) -> None:
     }
     for frame in range(log.frame_count):
         _add_frame(tables, log, frame, root, mount)
-    # The last sweep is late, so the path has to reach beyond it.
+    # The last sweep is late, so the poses must extend beyond it.
     _add_pose(tables, log, "end", int(log.frame_times_us[-1]) + 200_000)
     row = dict(tables["sample_data"][-1])
     tables["sample_data"].append(
@@ -83,7 +83,7 @@ def _pose(pose: np.ndarray) -> dict:
 
 
 def _ego(log: DrivingLog, t_us: int) -> np.ndarray:
-    """Straight on after the end."""
+    """Ego pose, extrapolated at constant velocity outside the log."""
     edge = min(max(t_us, log.ego.start_us), log.ego.end_us)
     pose = log.ego.transform(edge)
     pose[:3, 3] += log.ego.velocity(edge) * (t_us - edge) * 1e-6

@@ -1,4 +1,4 @@
-"""Waymo v1 TFRecord, encoded field by field; its LiDAR has neither beam angles nor pixel poses."""
+"""Waymo v1 TFRecord, encoded field by field, without beam angles and pixel poses."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""The solver's kernels on the CPU: their own source, compiled as C++; see ``render.kernel_twin``.
+"""The solver's kernels on the CPU, compiled from their source as C++; see ``render.kernel_twin``.
 
-What is compiled here is what NVRTC gets, line for line, the functions translated from Python
-included. Needs g++, as CI's machines have it; tests skip where it is not.
+The source is what NVRTC gets, line for line, including the functions translated from Python.
+Needs g++, which CI machines have; tests are skipped without it.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from real2sim_server.physics.backends.cuda.source import FOLDER, KERNELS, solver
 from ...render.kernel_twin import KernelTwin, compiled_twin
 
 HERE = Path(__file__).parent
-# Functions from Python have variables that one way through them leaves alone.
+# Functions translated from Python have variables that some paths leave unset.
 UNUSED = ("-Wno-unused-but-set-variable", "-Wno-unused-parameter", "-Wno-unused-variable")
 
 
@@ -42,10 +42,10 @@ class TwinLauncher(KernelTwin):
 
     Args:
         precision: ``single`` or ``double``.
-        backwards: run blocks, and the threads of each, in the opposite order.
+        backwards: run blocks, and the threads of each, in reverse order.
 
     Attributes:
-        sequences: what was asked for, sequence by sequence.
+        sequences: what was requested, sequence by sequence.
     """
 
     def __init__(self, precision: str, *, backwards: bool = False) -> None:

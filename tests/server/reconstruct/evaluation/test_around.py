@@ -1,4 +1,4 @@
-"""Views from all around vehicles, against the truth."""
+"""Views from all sides of vehicles against ground truth."""
 
 from dataclasses import replace
 
@@ -34,7 +34,7 @@ def street():
 
 
 @pytest.mark.parametrize("azimuth", [0.0, np.pi / 2, np.pi, -1.0])
-def test_a_view_shows_the_middle_of_its_object_from_that_side(street, azimuth):
+def test_a_view_is_centred_on_its_object_from_the_azimuth(street, azimuth):
     track = street.tracks[0]
     t_us = track.trajectory.start_us
     camera, T_world_camera = view_from(track, t_us, azimuth)
@@ -52,7 +52,7 @@ def test_a_car_ahead_is_seen_from_behind(street):
     assert np.cos(np.array(azimuths) - np.pi).min() > 0.8
 
 
-def test_a_missing_vehicle_half_covers_less(street):
+def test_a_missing_vehicle_half_lowers_coverage(street):
     options = InitialiseOptions(
         max_background=8_000, max_object=3_000, voxel=0.3, ground_spacing=0.5, sky_resolution=16
     )

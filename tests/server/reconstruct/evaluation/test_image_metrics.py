@@ -11,7 +11,7 @@ def noise_image(seed: int, shape=(40, 52, 3)) -> np.ndarray:
 
 
 def plain_ssim(image: np.ndarray, truth: np.ndarray) -> float:
-    """Pixel by pixel, as in Wang et al. 2004, zero outside the image."""
+    """SSIM per pixel, as in Wang et al. 2004, zero-padded."""
     taps = np.arange(-5, 6)
     window = np.exp(-(taps[:, None] ** 2 + taps[None] ** 2) / (2 * 1.5**2))
     window /= window.sum()
@@ -32,7 +32,7 @@ def plain_ssim(image: np.ndarray, truth: np.ndarray) -> float:
     return float(np.mean(values))
 
 
-def test_psnr_of_noise_of_known_strength_is_the_textbook_value():
+def test_psnr_of_known_noise_matches_the_formula():
     truth = np.full((200, 300, 3), 128, np.uint8)
     noise = np.random.default_rng(1).normal(0, 10, truth.shape)
     image = np.rint(truth + noise).astype(np.uint8)
@@ -40,7 +40,7 @@ def test_psnr_of_noise_of_known_strength_is_the_textbook_value():
     assert psnr(image, truth) == pytest.approx(10 * np.log10(255**2 / (100 + 1 / 12)), abs=0.05)
 
 
-def test_psnr_within_a_mask_ignores_what_is_outside():
+def test_psnr_ignores_pixels_outside_the_mask():
     truth = np.zeros((10, 10, 3), np.uint8)
     image = truth.copy()
     image[:, 5:] = 255
@@ -50,25 +50,25 @@ def test_psnr_within_a_mask_ignores_what_is_outside():
     assert psnr(image, truth, mask) == pytest.approx(20 * np.log10(5))
 
 
-def test_an_image_against_itself_counts_as_the_cap_in_means():
+def test_infinite_psnr_counts_as_the_cap_in_means():
     image = noise_image(2)
     assert psnr(image, image) == float("inf")
     assert mean_psnr([psnr(image, image), 20.0]) == (PSNR_CAP + 20) / 2
 
 
-def test_means_leave_out_views_without_a_value():
+def test_means_ignore_nan():
     assert mean_psnr([float("nan"), 20.0, 30.0]) == 25
     assert np.isnan(mean_psnr([float("nan")]))
 
 
-def test_ssim_is_that_of_a_plain_implementation():
+def test_ssim_matches_a_plain_implementation():
     truth = noise_image(3, (14, 17, 3))
     image = np.clip(truth.astype(int) + noise_image(4, truth.shape) // 4 - 20, 0, 255)
     image = image.astype(np.uint8)
     assert ssim(image, truth) == pytest.approx(plain_ssim(image, truth), abs=1e-9)
 
 
-def test_ssim_of_equal_images_is_one_and_of_unrelated_ones_near_zero():
+def test_ssim_is_one_for_equal_and_near_zero_for_unrelated_images():
     image = noise_image(5)
     assert ssim(image, image) == pytest.approx(1, abs=1e-12)
     assert abs(ssim(image, noise_image(6))) < 0.1

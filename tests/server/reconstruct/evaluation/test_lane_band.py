@@ -24,14 +24,14 @@ def log():
     return painted_log(frames=3, boxes=False)
 
 
-def test_road_points_have_the_colour_of_the_road_and_lie_on_the_ground(log):
+def test_road_points_have_the_road_colour_and_lie_on_the_ground(log):
     road = road_colours(log, log.rig["front"], Ground.level(0.0))
     assert len(road.points) > 500
     np.testing.assert_allclose(road.points[:, 2], 0, atol=1e-6)
     np.testing.assert_allclose(road.colours, np.broadcast_to(ROAD_COLOUR, road.colours.shape))
 
 
-def test_from_beside_a_road_point_lies_farther_to_the_other_side(log):
+def test_a_lateral_camera_offset_shifts_road_points(log):
     camera = log.rig["front"]
     road = road_colours(log, camera, Ground.level(0.0))
     one = replace(road, points=np.array([[8.0, 0, 0]]), colours=road.colours[:1])
@@ -39,7 +39,7 @@ def test_from_beside_a_road_point_lies_farther_to_the_other_side(log):
     assert columns[1] - columns[0] == pytest.approx(camera.K[0, 0] / 8.0, abs=1)
 
 
-def test_what_lies_in_boxes_is_not_compared():
+def test_road_points_inside_boxes_are_ignored():
     log = painted_log(frames=5)
     camera = log.rig["front"]
     road = road_colours(log, camera, Ground.level(0.0))
@@ -48,7 +48,7 @@ def test_what_lies_in_boxes_is_not_compared():
     assert len(projected_road(inside, log, camera, 200_000, 0.0)[0]) == 0
 
 
-def test_a_scene_with_the_right_road_scores_high_and_one_with_another_low(log):
+def test_the_score_drops_for_a_wrong_road_colour(log):
     scene = initialise_scene(log, options=SMALL)
     [good] = evaluate_lane_band(scene, log, log.rig["front"], [1], [1.0])
     dark = replace(
@@ -62,7 +62,7 @@ def test_a_scene_with_the_right_road_scores_high_and_one_with_another_low(log):
     assert good.images_psnr == bad.images_psnr > 40
 
 
-def test_no_view_is_compared_from_close_beside_a_box(log):
+def test_views_close_to_a_box_are_skipped(log):
     scene = initialise_scene(log, options=SMALL)
     times = log.frame_times_us
     pose = np.eye(4)

@@ -23,7 +23,7 @@ def wall(depth: float, *, reach: float = 4.0) -> np.ndarray:
     return np.stack([x.ravel(), y.ravel(), np.full(x.size, depth)], axis=1)
 
 
-def test_a_plane_rendered_too_far_is_off_by_that_much():
+def test_the_error_of_a_plane_is_its_depth_offset():
     depth = np.full((200, 300), 10.25, np.float32)
     errors = depth_errors(depth, wall(10.0), CAMERA)
     assert len(errors) > 1000
@@ -38,7 +38,7 @@ def test_a_slope_is_compared_at_the_depth_of_each_point():
     true_depth = np.where(rows > 0, 1.5 * 150 / np.maximum(rows, 1e-9), 0)
     depth = np.repeat(true_depth[:, None], 300, axis=1).astype(np.float32)
     errors = depth_errors(depth, points, CAMERA)
-    # Within half a row, which is z^2 / (h f) / 2.
+    # The error of half a row is z^2 / (h f) / 2.
     assert errors.max() <= (z**2 / (1.5 * 150) / 2).max() * 1.1
     assert median_error(errors) < 0.4
 
@@ -52,7 +52,7 @@ def test_holes_count_as_infinite_errors():
     assert median_error(depth_errors(depth, wall(10.0), CAMERA)) == float("inf")
 
 
-def test_points_behind_something_nearer_are_not_compared():
+def test_occluded_points_are_ignored():
     near, far = wall(5.0, reach=1.0), wall(20.0, reach=15.0)
     rows, columns, depths = seen_points(np.concatenate([near, far]), CAMERA)
     assert (depths == 5.0).sum() == len(near)
@@ -61,7 +61,7 @@ def test_points_behind_something_nearer_are_not_compared():
     assert (depths == 20.0).any()
 
 
-def test_a_receding_road_does_not_hide_itself():
+def test_a_receding_road_does_not_occlude_itself():
     x, z = np.meshgrid(np.arange(-3, 3, 0.2), np.arange(3, 40, 0.5))
     road = np.stack([x.ravel(), np.full(x.size, 1.6), z.ravel()], axis=1)
     inside = np.abs(road[:, 0] / road[:, 2]) < 1
@@ -69,26 +69,26 @@ def test_a_receding_road_does_not_hide_itself():
     assert len(depths) > 0.95 * (inside & (1.6 * 150 / road[:, 2] < 100)).sum()
 
 
-def test_points_behind_the_camera_or_far_away_are_left_out():
+def test_points_behind_the_camera_or_out_of_range_are_ignored():
     points = np.array([[0, 0, -5.0], [0, 0, 0.2], [0, 0, 100.0]])
     assert len(depth_errors(np.ones((200, 300), np.float32), points, CAMERA)) == 0
     assert np.isnan(median_error(np.zeros(0)))
 
 
-def test_a_sweep_is_brought_into_the_camera_frame():
+def test_a_sweep_is_transformed_to_the_camera_frame():
     log = painted_log(boxes=False, frames=2)
     points = points_in_camera(log, log.rig["front"], 1, int(log.frame_times_us[1]))
     assert points[:, 2].max() == pytest.approx(WALL_X)
     assert points[:, 1].max() == pytest.approx(1.6, abs=1e-5)
 
 
-def test_nine_of_ten_errors_do_not_exceed_the_percentile():
+def test_error_p90_is_the_90th_percentile():
     errors = np.arange(1.0, 101.0)
     assert error_p90(errors) == 90
     assert error_p90(np.append(np.zeros(9), 5.0)) == 0
 
 
-def test_more_holes_than_a_tenth_make_the_percentile_infinite():
+def test_more_than_a_tenth_of_holes_makes_p90_infinite():
     few, many = np.zeros(100), np.zeros(100)
     few[:10] = many[:11] = np.inf
     assert error_p90(few) == 0

@@ -13,7 +13,7 @@ from ..conftest import painted_log
 FRAME = 4
 
 
-def test_equal_images_have_a_black_error_and_larger_errors_are_brighter():
+def test_error_images_are_brighter_for_larger_errors():
     truth = np.full((4, 6, 3), 100, np.uint8)
     image = truth.copy()
     image[:, 2:4] += 20
@@ -23,7 +23,7 @@ def test_equal_images_have_a_black_error_and_larger_errors_are_brighter():
     assert brightness[0] < brightness[2] < brightness[4]
 
 
-def test_depth_is_red_near_blue_far_and_black_where_nothing_is():
+def test_depth_images_run_from_red_to_blue_with_black_holes():
     image = depth_image(np.array([[3.0, 60.0, 0.0]], np.float32))[0].astype(int)
     assert image[0, 0] > image[0, 2]
     assert image[1, 2] > image[1, 0]
@@ -42,7 +42,7 @@ def test_a_crop_shows_the_box_of_a_moving_object():
     assert mask[window].mean() > 0.5
 
 
-def test_an_object_right_behind_another_one_is_not_cropped():
+def test_an_occluded_object_is_not_cropped():
     log = painted_log()
     track = log.tracks[0]
     path = track.trajectory

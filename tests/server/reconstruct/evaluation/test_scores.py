@@ -1,4 +1,4 @@
-"""Scores of a whole scene, on a street small enough for every run, and of its log on disk."""
+"""Evaluation of a whole scene on a small street, and of its log on disk."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def with_provenance(scene, **reconstruction):
     return replace(scene, provenance={**scene.provenance, "reconstruction": reconstruction})
 
 
-def test_frames_that_training_kept_back_are_compared_and_count_as_unseen(street, street_scene):
+def test_held_out_frames_are_evaluated_as_held_out(street, street_scene):
     trained = with_provenance(street_scene, stage=1, held_out_frames=[1, 4])
     assert select_frames(trained, street, "held-out") == select_frames(trained, street, [4, 1])
     assert select_frames(trained, street, "held-out").frames == (1, 4)
@@ -74,13 +74,13 @@ def test_frames_that_training_kept_back_are_compared_and_count_as_unseen(street,
     assert not select_frames(trained, street, [1, 2]).held_out
 
 
-def test_without_training_every_fourth_frame_is_compared_and_counts_as_seen(street, street_scene):
+def test_untrained_scenes_are_evaluated_on_every_fourth_frame(street, street_scene):
     chosen = select_frames(street_scene, street, "held-out")
     assert (chosen.frames, chosen.held_out) == ((2,), False)
     assert select_frames(street_scene, street, "all").frames == tuple(range(6))
 
 
-def test_a_frame_that_is_not_there_is_refused(street, street_scene):
+def test_an_invalid_frame_selection_is_refused(street, street_scene):
     with pytest.raises(ReconstructError, match=r"frame 6: .* has frames 0 to 5"):
         select_frames(street_scene, street, [2, 6])
     with pytest.raises(ReconstructError, match="'held-out', 'all' or numbers, not 'some'"):
@@ -108,7 +108,7 @@ def test_a_scene_of_a_flat_wall_and_box_has_small_depth_errors():
     assert result.views[0].object_pixels == logged_mask(log, log.rig["front"], 2).sum()
 
 
-def test_objects_are_scored_apart_from_the_rest(street, street_scene):
+def test_object_pixels_have_their_own_psnr(street, street_scene):
     without = replace(street_scene, objects={})
     whole = evaluate_scene(street_scene, street, options=ONCE)
     bare = evaluate_scene(without, street, options=ONCE)
@@ -116,7 +116,7 @@ def test_objects_are_scored_apart_from_the_rest(street, street_scene):
     assert bare.psnr_objects < whole.psnr_objects - 1
 
 
-def test_the_street_of_a_log_on_disk_is_built_again(street, on_disk):
+def test_ground_truth_is_regenerated_from_a_log_on_disk(street, on_disk):
     truth = find_truth(open_log(on_disk / "log"))
     assert truth.log is not None
     camera, t_us = street.rig["front"], int(street.frame_times_us[3])
@@ -126,7 +126,7 @@ def test_the_street_of_a_log_on_disk_is_built_again(street, on_disk):
     np.testing.assert_array_equal(depth_again, depth)
 
 
-def test_a_log_that_does_not_show_its_config_has_no_truth(street, on_disk):
+def test_a_log_that_does_not_match_its_config_has_no_ground_truth(street, on_disk):
     log = open_log(on_disk / "log")
     config = {**log.provenance["config"], "seed": 6}
     truth = find_truth(replace(log, provenance={**log.provenance, "config": config}))
@@ -134,14 +134,14 @@ def test_a_log_that_does_not_show_its_config_has_no_truth(street, on_disk):
     assert "another street" in truth.missing
 
 
-def test_a_recorded_log_has_no_truth_and_says_so():
+def test_a_recorded_log_has_no_ground_truth():
     log = painted_log(frames=3)
     truth = find_truth(log)
     assert truth.log is None
     assert "only its own images are known" in truth.missing
 
 
-def test_a_shift_moves_the_camera_to_its_left(street):
+def test_a_positive_shift_moves_the_camera_left(street):
     t_us = int(street.frame_times_us[2])
     camera = street.rig["front"]
     _, _, here = true_view(street, camera, t_us, 0.0)
@@ -150,7 +150,7 @@ def test_a_shift_moves_the_camera_to_its_left(street):
     np.testing.assert_allclose(np.linalg.inv(here) @ there @ [0, 0, 0, 1], [-2, 0, 0, 1], atol=1e-9)
 
 
-def test_views_beside_the_path_are_compared_on_both_sides(street, street_scene):
+def test_shifted_views_are_evaluated_on_both_sides(street, street_scene):
     times = [int(street.frame_times_us[2])]
     near, far = evaluate_shifts(street_scene, street, list(street.rig), times, [0.5, 3.0])
     assert near.views + near.views_in_objects == far.views + far.views_in_objects == 2
@@ -158,7 +158,7 @@ def test_views_beside_the_path_are_compared_on_both_sides(street, street_scene):
     assert near.depth_error_m < 0.5
 
 
-def test_the_command_leaves_figures_and_a_page_that_loads_nothing(on_disk):
+def test_the_command_writes_json_and_a_self_contained_report(on_disk):
     figures, page = on_disk / "figures.json", on_disk / "report" / "report.html"
     arguments = ["evaluate", on_disk / "scene.r2s", on_disk / "log", "--json", figures]
     arguments += ["--frames", "2,3", "--shifts", "1", "--report", page.parent]
@@ -183,7 +183,7 @@ def test_the_command_leaves_figures_and_a_page_that_loads_nothing(on_disk):
     assert f"<td>{values['depth_error_p90_m']:.3f}</td>" in html
 
 
-def test_a_scene_of_a_part_of_the_log_is_compared_with_that_part(on_disk, tmp_path):
+def test_a_scene_of_part_of_a_log_is_evaluated_on_that_part(on_disk, tmp_path):
     scene, figures = tmp_path / "part.r2s", tmp_path / "figures.json"
     part = ["--frames", "2:5", "--cameras", "front"]
     commands = [
@@ -201,21 +201,21 @@ def test_a_scene_of_a_part_of_the_log_is_compared_with_that_part(on_disk, tmp_pa
 
 
 @pytest.mark.parametrize("frames", ["5", "a:b", "-1:3"])
-def test_a_stretch_that_is_none_is_refused(on_disk, tmp_path, frames):
+def test_an_invalid_frame_range_is_refused(on_disk, tmp_path, frames):
     arguments = ["reconstruct", on_disk / "log", "--out", tmp_path / "x.r2s", "--frames", frames]
     result = CliRunner().invoke(app, [str(a) for a in arguments])
     assert result.exit_code == 1
     assert "first:stop such as 50:100" in result.output
 
 
-def test_the_command_says_what_frames_may_be(on_disk):
+def test_the_command_lists_the_allowed_frame_values(on_disk):
     arguments = ["evaluate", str(on_disk / "scene.r2s"), str(on_disk / "log"), "--frames", "2-5"]
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 1
     assert "held-out, all, or numbers" in result.output
 
 
-def test_figures_without_truth_say_why_and_hold_no_shifted_views():
+def test_results_without_ground_truth_explain_missing_shifted_views():
     log = painted_log(frames=3, boxes=False)
     scene = initialise_scene(log, options=SMALL)
     result = evaluate_scene(scene, log, options=replace(ONCE, shifts=(1.0,)))
@@ -242,7 +242,7 @@ def test_boxes_of_the_log_itself_have_no_error(street, street_scene):
     assert box_error(street_scene, street) == pytest.approx(0, abs=1e-9)
 
 
-def test_the_box_error_is_the_distance_of_the_centres(street, street_scene):
+def test_the_box_error_is_the_distance_between_centres(street, street_scene):
     shift = np.eye(4)
     shift[:2, 3] = 0.3, 0.4
     objects = {

@@ -1,4 +1,4 @@
-"""Whether drawn uncertainty tells where new images are wrong, and how its figures are made."""
+"""Rendered uncertainty against errors of held-out images, and its metrics."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def street():
 
 @pytest.fixture(scope="module")
 def scene(street):
-    """Made without frame 2."""
+    """A scene built without frame 2."""
     made = initialise_scene(training_log(street, 4), options=SMALL)
     provenance = made.provenance | {"reconstruction": {"held_out_frames": HELD_OUT}}
     return replace(made, provenance=provenance, frame_times_us=street.frame_times_us)
@@ -58,7 +58,7 @@ def fitted(scene, street):
     return fit_uncertainties(scene, street, backend="cpu")
 
 
-def test_uncertainty_ranks_the_errors_of_images_that_were_withheld(fitted, street):
+def test_uncertainty_ranks_the_errors_of_held_out_images(fitted, street):
     made, report = fitted
     assert report.views == 4
     views = [(street.rig["front"], frame) for frame in HELD_OUT]
@@ -69,7 +69,7 @@ def test_uncertainty_ranks_the_errors_of_images_that_were_withheld(fitted, stree
     assert score.uncertainty == pytest.approx(score.error, rel=0.35)
 
 
-def test_what_no_training_ray_has_met_is_as_uncertain_as_a_guess(fitted, scene, street):
+def test_gaussians_without_training_rays_have_the_unseen_uncertainty(fitted, scene, street):
     made, report = fitted
     values = made.background.uncertainties
     behind = (made.background.means[:, 0] < -15).nonzero()[:, 0]
@@ -81,21 +81,21 @@ def test_what_no_training_ray_has_met_is_as_uncertain_as_a_guess(fitted, scene, 
     assert evaluate_uncertainty(scene, street, [(street.rig["front"], 2)]) is None
 
 
-def test_the_same_scene_and_log_give_the_same_bits(fitted, scene, street):
+def test_fitting_is_reproducible(fitted, scene, street):
     again, _ = fit_uncertainties(scene, street, backend="cpu")
     first = fitted[0]
     assert again.background.uncertainties.equal(first.background.uncertainties)
     assert again.sky.uncertainties.equal(first.sky.uncertainties)
 
 
-def test_without_any_image_to_compare_it_is_refused(scene, street):
+def test_fitting_without_training_images_is_refused(scene, street):
     everything = replace(scene, provenance={"reconstruction": {"held_out_frames": list(range(5))}})
     with pytest.raises(ReconstructError, match="no image of a pinhole camera"):
         fit_uncertainties(everything, street)
 
 
 @pytest.mark.slow
-def test_the_commands_fit_and_judge_it(scene, street, tmp_path):
+def test_the_commands_fit_evaluate_and_render_uncertainty(scene, street, tmp_path):
     write_native_log(street, tmp_path / "log")
     save_scene(scene, tmp_path / "a.r2s")
     for arguments in (
@@ -122,14 +122,14 @@ def test_the_commands_fit_and_judge_it(scene, street, tmp_path):
     assert json.loads((tmp_path / "judged.json").read_text())["uncertainty"]["spearman"] > 0.6
 
 
-def test_rank_correlation_is_that_of_the_ranks_and_0_for_a_constant():
+def test_rank_correlation_uses_ranks_and_is_0_for_a_constant():
     values = np.arange(12, dtype=np.float32).reshape(3, 4)
     assert rank_correlation(values, np.exp(values)) == pytest.approx(1)
     assert rank_correlation(values, -values) == pytest.approx(-1)
     assert rank_correlation(values, np.zeros_like(values)) == 0
 
 
-def test_sparsification_is_0_by_the_errors_themselves_and_1_by_chance():
+def test_sparsification_is_0_for_the_true_order_and_1_for_a_random_one():
     error = np.random.default_rng(1).random(20_000).astype(np.float32)
     chance = np.random.default_rng(2).random(20_000).astype(np.float32)
     assert sparsification(error**3, error) == pytest.approx(0, abs=1e-6)

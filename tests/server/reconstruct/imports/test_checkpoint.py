@@ -14,7 +14,7 @@ from real2sim_server.reconstruct.imports.street_gaussians import fourier_basis
 
 
 class Trap:
-    """Runs code when it is unpickled."""
+    """An object that runs code when unpickled."""
 
     def __init__(self, marker: Path) -> None:
         self.marker = marker
@@ -32,7 +32,7 @@ def test_code_in_a_checkpoint_is_never_run(tmp_path, as_zip):
     assert not (tmp_path / "was here").exists()
 
 
-def test_objects_that_would_have_to_be_run_are_named(tmp_path):
+def test_pickled_code_is_named_in_the_error(tmp_path):
     torch.save({"background": Trap(tmp_path / "x")}, tmp_path / "a.pth")
     with pytest.raises(CheckpointError, match=r"besides tensors .*(touch|Path).*tensors only"):
         import_checkpoint(tmp_path / "a.pth")
@@ -54,13 +54,13 @@ def test_tensors_numbers_and_numpy_scalars_are_read(tmp_path, as_zip):
 
 
 @pytest.mark.parametrize("data", [b"", b"hello", b"PK\x03\x04" + bytes(50), b"\x80\x02."])
-def test_what_is_no_checkpoint_is_refused(tmp_path, data):
+def test_a_file_that_is_not_a_checkpoint_is_refused(tmp_path, data):
     (tmp_path / "a.pth").write_bytes(data)
     with pytest.raises(CheckpointError, match=r"a\.pth: .*no checkpoint of torch, or damaged"):
         load_checkpoint(tmp_path / "a.pth")
 
 
-def test_a_checkpoint_cut_short_is_refused(tmp_path):
+def test_a_truncated_checkpoint_is_refused(tmp_path):
     torch.save({"a": torch.zeros(1000)}, tmp_path / "a.pth")
     whole = (tmp_path / "a.pth").read_bytes()
     for end in range(1, len(whole), 301):
@@ -74,7 +74,7 @@ def test_a_missing_file_is_refused(tmp_path):
         load_checkpoint(tmp_path / "a.pth")
 
 
-def test_other_checkpoints_are_refused_with_what_they_hold(tmp_path):
+def test_unknown_checkpoints_are_refused_with_their_keys(tmp_path):
     torch.save({"state_dict": {}, "epoch": 3}, tmp_path / "a.pth")
     with pytest.raises(CheckpointError, match=r"holds \['epoch', 'state_dict'\]; a Street"):
         import_checkpoint(tmp_path / "a.pth")
@@ -94,12 +94,12 @@ def test_other_checkpoints_are_refused_with_what_they_hold(tmp_path):
         ({"world": "up"}, "world 'up'; allowed are"),
     ],
 )
-def test_options_that_make_no_sense_are_refused(options, reason):
+def test_invalid_options_are_refused(options, reason):
     with pytest.raises(CheckpointError, match=reason):
         CheckpointOptions(**options)
 
 
-def test_the_fourier_basis_is_sines_and_cosines_of_whole_turns():
+def test_the_fourier_basis_has_period_one():
     t = 0.13
     full = 2 * np.pi * t
     expected = [1, np.sin(full), np.cos(full), np.sin(2 * full), np.cos(2 * full)]

@@ -36,7 +36,7 @@ def test_gaussians_are_activated(tmp_path):
     torch.testing.assert_close(cloud.sh, expected)
 
 
-def test_instances_become_objects_at_their_poses(tmp_path):
+def test_instances_become_objects_with_their_poses(tmp_path):
     scene = imported(tmp_path).scene
     assert list(scene.objects) == ["vehicle_0", "vehicle_1"]
     assert scene.objects["vehicle_1"].size == (8.0, 2.5, 3.0)
@@ -53,19 +53,19 @@ def test_instances_become_objects_at_their_poses(tmp_path):
         np.testing.assert_allclose(given, pose(10 * i + 2, 2, 0.5, 0.3 * i + 0.2), atol=1e-6)
 
 
-def test_each_gaussian_goes_to_its_own_instance(tmp_path):
+def test_gaussians_are_assigned_to_their_instances(tmp_path):
     scene = imported(tmp_path).scene
     means = rigid()["_means"]
     for i in (0, 1):
         assert torch.equal(scene.objects[f"vehicle_{i}"].cloud.means, means[i::3])
 
 
-def test_the_frame_rate_gives_the_times(tmp_path):
+def test_frame_times_follow_the_frame_rate(tmp_path):
     scene = imported(tmp_path, CheckpointOptions(frame_rate=2.0)).scene
     assert scene.frame_times_us.tolist() == [0, 500_000, 1_000_000, 1_500_000, 2_000_000]
 
 
-def test_colours_seen_from_the_world_are_those_of_the_checkpoint(tmp_path):
+def test_harmonics_are_rotated_to_the_object_frame(tmp_path):
     scene = imported(tmp_path).scene
     given = scene.objects["vehicle_1"]
     turn = given.trajectory.transform(200_000)[:3, :3]
@@ -78,14 +78,14 @@ def test_colours_seen_from_the_world_are_those_of_the_checkpoint(tmp_path):
     np.testing.assert_allclose(seen, wanted, atol=1e-5)
 
 
-def test_colours_without_harmonics_are_a_sigmoid(tmp_path):
+def test_colours_without_harmonics_use_a_sigmoid(tmp_path):
     cloud = imported(tmp_path, Background=studio_model(9, harmonics=0)).scene.background
     rgb = 0.5 + 0.28209479177387814 * cloud.sh[:, 0]
     torch.testing.assert_close(rgb, studio_model(9, harmonics=0)["_features_dc"].sigmoid())
 
 
 @pytest.mark.parametrize("columns", [1, 2])
-def test_balls_and_discs_get_three_scales(tmp_path, columns):
+def test_spheres_and_discs_get_three_scales(tmp_path, columns):
     cloud = imported(tmp_path, Background=studio_model(9, scales=columns)).scene.background
     given = studio_model(9, scales=columns)["_scales"].exp()
     torch.testing.assert_close(cloud.scales[:, :columns], given)
@@ -105,15 +105,15 @@ def directions():
     return torch.nn.functional.normalize(torch.randn(500, 3, generator=random))
 
 
-def test_the_sky_is_looked_up_in_its_own_axes(tmp_path, directions):
+def test_the_sky_uses_the_axes_of_drivestudio(tmp_path, directions):
     sky = imported(tmp_path).scene.sky
     x, y, z = directions.unbind(1)
-    # Its shader turns view directions (x, y, z) to (x, z, -y) first.
+    # The drivestudio shader maps view directions (x, y, z) to (x, z, -y).
     expected = torch.stack([x, z, -y], dim=1)
     assert (view_directions(sky, directions) * expected).sum(1).min() > np.cos(0.2)
 
 
-def test_a_world_of_the_front_camera_is_turned_upright(tmp_path, directions):
+def test_a_front_camera_world_is_rotated_upright(tmp_path, directions):
     options = CheckpointOptions(world="front_camera")
     upright, given = imported(tmp_path, options).scene, imported(tmp_path).scene
     # Right, down, ahead become ahead, left, up.
@@ -132,7 +132,7 @@ def test_a_world_of_the_front_camera_is_turned_upright(tmp_path, directions):
     )
 
 
-def test_models_that_are_lost_are_named(tmp_path):
+def test_unsupported_models_are_named(tmp_path):
     result = imported(
         tmp_path,
         DeformableNodes={"a": torch.zeros(1)},
@@ -149,7 +149,7 @@ def test_models_that_are_lost_are_named(tmp_path):
     assert "1 instances without Gaussians or visible frames" in text
 
 
-def test_without_a_dataset_one_camera_stands_at_the_start(tmp_path):
+def test_without_a_dataset_the_scene_has_one_fixed_camera(tmp_path):
     result = imported(tmp_path)
     scene = result.scene
     assert scene.rig.names == ("front",)
@@ -176,7 +176,7 @@ def write_folder(folder, *, waymo_axes):
 
 
 @pytest.mark.parametrize("waymo_axes", [True, False])
-def test_the_dataset_gives_cameras_and_the_path_of_the_ego(tmp_path, waymo_axes):
+def test_the_dataset_provides_cameras_and_the_ego_trajectory(tmp_path, waymo_axes):
     folder = write_folder(tmp_path / "023", waymo_axes=waymo_axes)
     scene = imported(tmp_path, CheckpointOptions(dataset=folder, first_frame=7)).scene
     assert scene.name == "023"
@@ -191,14 +191,14 @@ def test_the_dataset_gives_cameras_and_the_path_of_the_ego(tmp_path, waymo_axes)
     np.testing.assert_allclose(camera.T_vehicle_camera[:3, 1], [0, 0, -1], atol=1e-6)
 
 
-def test_only_the_cameras_asked_for_are_taken(tmp_path):
+def test_only_requested_cameras_are_imported(tmp_path):
     folder = write_folder(tmp_path / "023", waymo_axes=True)
     options = CheckpointOptions(dataset=folder, cameras=(2,))
     camera = imported(tmp_path, options).scene.rig["camera_2"]
     np.testing.assert_allclose(camera.T_vehicle_camera[0, 2], np.cos(3.0), atol=1e-6)
 
 
-def test_it_becomes_a_bundle_and_its_kind_is_told_by_its_keys(tmp_path):
+def test_a_checkpoint_is_recognised_and_saved_as_a_bundle(tmp_path):
     torch.save(studio_state(), tmp_path / "a.pth")
     save_scene(import_checkpoint(tmp_path / "a.pth").scene, tmp_path / "a.r2s")
     loaded = load_scene(tmp_path / "a.r2s")
@@ -206,7 +206,7 @@ def test_it_becomes_a_bundle_and_its_kind_is_told_by_its_keys(tmp_path):
     assert loaded.provenance["iteration"] == 30_000
 
 
-def test_a_checkpoint_of_a_background_alone_is_a_scene(tmp_path):
+def test_a_checkpoint_with_only_a_background_is_imported(tmp_path):
     scene = imported(tmp_path, RigidNodes=None, Sky=None).scene
     assert (dict(scene.objects), scene.sky) == ({}, None)
     assert scene.end_us > scene.start_us
@@ -231,19 +231,19 @@ def test_a_checkpoint_of_a_background_alone_is_a_scene(tmp_path):
         ({"Sky": {"base": torch.zeros(5, 4, 4, 3)}}, r"'base' is \[5, 4, 4, 3\], not \[6"),
     ],
 )
-def test_checkpoints_that_do_not_fit_are_refused(tmp_path, models, reason):
+def test_inconsistent_checkpoints_are_refused(tmp_path, models, reason):
     with pytest.raises(CheckpointError, match=reason) as refused:
         imported(tmp_path, **models)
     assert "checkpoint_final.pth" in str(refused.value)
 
 
-def test_a_clip_of_another_length_is_refused(tmp_path):
+def test_a_clip_with_another_number_of_frames_is_refused(tmp_path):
     options = CheckpointOptions(first_frame=3, last_frame=9)
     with pytest.raises(CheckpointError, match="have 5 frames; 3 to 9 are 7"):
         imported(tmp_path, options)
 
 
-def test_dataset_folders_that_do_not_fit_are_refused(tmp_path):
+def test_mismatched_dataset_folders_are_refused(tmp_path):
     folder = write_folder(tmp_path / "023", waymo_axes=True)
     options = CheckpointOptions(dataset=folder)
     with pytest.raises(CheckpointError, match=r"020\.txt: cannot be read"):

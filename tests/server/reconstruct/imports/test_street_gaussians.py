@@ -31,7 +31,7 @@ def options(world, tmp_path):
 
 @pytest.fixture
 def plain(tmp_path):
-    """A world of one kind, where the columns do not matter."""
+    """A single world, for tests that do not depend on the columns."""
     world = StreetWorld()
     return world, replace(OPTIONS, dataset=world.write_folder(tmp_path / "002"))
 
@@ -45,7 +45,7 @@ def track_of(scene, track):
     return next(o for o in scene.objects.values() if o.object_id.endswith(f"_{track}"))
 
 
-def test_objects_stand_where_corrected_tracks_say(world, options, tmp_path):
+def test_objects_have_the_corrected_track_poses(world, options, tmp_path):
     scene = imported(world, options, tmp_path).scene
     assert {o.split("_")[1] for o in scene.objects} == {str(t) for t in world.movers}
     for (frame, track), _ in world.columns.items():
@@ -62,7 +62,7 @@ def test_an_object_exists_from_its_first_to_its_last_frame(world, options, tmp_p
         assert track_of(scene, track).trajectory.times_us.tolist() == expected
 
 
-def test_gaussians_of_objects_reach_the_world_through_their_pose(world, options, tmp_path):
+def test_object_gaussians_are_posed_in_the_world(world, options, tmp_path):
     scene = imported(world, options, tmp_path).scene
     given = track_of(scene, 8)
     xyz = world.state()["obj_008"]["xyz"].detach().double().numpy()
@@ -85,7 +85,7 @@ def test_gaussians_are_activated(plain, tmp_path):
     torch.testing.assert_close(cloud.sh, expected)
 
 
-def test_colours_over_time_keep_the_middle_of_life(world, options, tmp_path):
+def test_time_varying_colours_are_evaluated_at_mid_life(world, options, tmp_path):
     result = imported(world, options, tmp_path)
     series = world.state()["obj_007"]["feature_dc"].detach()
     # At half of its time: 1, sin 2 pi t = 0, cos 2 pi t = -1, sin 4 pi t = 0, cos 4 pi t = 1.
@@ -96,7 +96,7 @@ def test_colours_over_time_keep_the_middle_of_life(world, options, tmp_path):
     assert any("change colour over time" in w for w in result.warnings)
 
 
-def test_colours_seen_from_the_world_are_those_of_the_checkpoint(world, options, tmp_path):
+def test_harmonics_are_rotated_to_the_object_frame(world, options, tmp_path):
     scene = imported(world, options, tmp_path).scene
     for track in (3, 8):
         given = track_of(scene, track)
@@ -111,25 +111,25 @@ def test_colours_seen_from_the_world_are_those_of_the_checkpoint(world, options,
         np.testing.assert_allclose(seen, wanted, atol=1e-5)
 
 
-def test_the_sky_looks_the_same_in_every_direction(plain, tmp_path):
+def test_the_sky_keeps_its_directions(plain, tmp_path):
     world, options = plain
     sky = imported(world, options, tmp_path).scene.sky
     directions = torch.nn.functional.normalize(
         torch.randn(500, 3, generator=torch.Generator().manual_seed(0))
     )
     seen = sky.sample(directions) * 2 - 1
-    # Colours say where pixels look; at 8 pixels a face they are at most 13 degrees apart.
+    # Colours encode view directions. At 8 pixels per face they are at most 13 degrees apart.
     assert (torch.nn.functional.normalize(seen) * directions).sum(1).min() > np.cos(0.2)
 
 
-def test_sizes_are_the_largest_of_all_frames_of_the_folder(world, options, tmp_path):
+def test_sizes_are_the_maximum_over_all_frames(world, options, tmp_path):
     scene = imported(world, options, tmp_path).scene
     assert track_of(scene, 7).size == pytest.approx((4.7, 1.8, 2.0))
     assert track_of(scene, 3).size == pytest.approx((4.3, 1.8, 1.5))
     assert (track_of(scene, 7).category, track_of(scene, 8).category) == ("car", "pedestrian")
 
 
-def test_cameras_ego_and_times_come_from_the_folder(plain, tmp_path):
+def test_the_dataset_provides_cameras_ego_and_times(plain, tmp_path):
     world, options = plain
     scene = imported(world, options, tmp_path).scene
     assert scene.frame_times_us.tolist() == [round(world.seconds(f) * 1e6) for f in world.frames]
@@ -143,7 +143,7 @@ def test_cameras_ego_and_times_come_from_the_folder(plain, tmp_path):
     assert camera.T_vehicle_camera[:3, 3].tolist() == [1.5, 0.1, 2]
 
 
-def test_the_size_of_images_counts_where_there_are_some(plain, tmp_path):
+def test_image_files_determine_the_camera_size(plain, tmp_path):
     world, options = plain
     head = b"\x89PNG\r\n\x1a\n" + bytes(8) + (640).to_bytes(4, "big") + (427).to_bytes(4, "big")
     (options.dataset / "images" / "000010_1.png").write_bytes(head)
@@ -152,7 +152,7 @@ def test_the_size_of_images_counts_where_there_are_some(plain, tmp_path):
     assert rig["front"].width == 1920
 
 
-def test_without_corrections_tracks_are_those_of_the_folder(world, options, tmp_path):
+def test_without_corrections_the_dataset_tracks_are_used(world, options, tmp_path):
     scene = imported(world, options, tmp_path, actor_pose={}).scene
     position, _ = world.given_in_vehicle(12, 8)
     given = track_of(scene, 8).trajectory.transform(round(world.seconds(12) * 1e6))
@@ -160,7 +160,7 @@ def test_without_corrections_tracks_are_those_of_the_folder(world, options, tmp_
     np.testing.assert_allclose(given[:3, 3], expected[:3], atol=1e-6)
 
 
-def test_it_becomes_a_bundle(world, options, tmp_path):
+def test_an_imported_scene_is_saved_as_a_bundle(world, options, tmp_path):
     scene = imported(world, options, tmp_path).scene
     save_scene(scene, tmp_path / "a.r2s")
     loaded = load_scene(tmp_path / "a.r2s")
@@ -168,7 +168,7 @@ def test_it_becomes_a_bundle(world, options, tmp_path):
     assert loaded.provenance["cameras"] == [0, 1]
 
 
-def test_its_kind_is_told_by_its_keys(plain, tmp_path):
+def test_a_checkpoint_is_recognised_by_its_keys(plain, tmp_path):
     world, options = plain
     torch.save(world.state(), tmp_path / "a.pth")
     assert import_checkpoint(tmp_path / "a.pth", options).scene.provenance["source"] == (
@@ -176,7 +176,7 @@ def test_its_kind_is_told_by_its_keys(plain, tmp_path):
     )
 
 
-def test_checkpoints_that_are_not_final_are_read_too(plain, tmp_path):
+def test_intermediate_checkpoints_are_read(plain, tmp_path):
     world, options = plain
     background = street_model(30) | {
         "spatial_lr_scale": np.float64(10.0),
@@ -186,7 +186,7 @@ def test_checkpoints_that_are_not_final_are_read_too(plain, tmp_path):
     assert len(imported(world, options, tmp_path, background=background).scene.background) == 30
 
 
-def test_parts_that_are_lost_are_named(plain, tmp_path):
+def test_unsupported_parts_are_named(plain, tmp_path):
     world, options = plain
     params = {"params": {"affine_trans": torch.zeros(2, 3, 4)}}
     codebook = {"params": {"sky_codebook": torch.zeros(32, 12)}}
@@ -196,7 +196,7 @@ def test_parts_that_are_lost_are_named(plain, tmp_path):
     assert any("codebook" in w for w in result.warnings)
 
 
-def test_a_scene_of_standing_objects_only_has_none(plain, tmp_path):
+def test_parked_tracks_do_not_become_objects(plain, tmp_path):
     _, options = plain
     world = StreetWorld(rows={10: [5], 11: [5]}, columns={}, width=1)
     world.write_folder(options.dataset)
@@ -204,7 +204,7 @@ def test_a_scene_of_standing_objects_only_has_none(plain, tmp_path):
     assert dict(scene.objects) == {}
 
 
-# What does not fit
+# Invalid input
 
 
 @pytest.mark.parametrize(
@@ -234,14 +234,14 @@ def test_a_scene_of_standing_objects_only_has_none(plain, tmp_path):
         ({"background": street_model(9, harmonics=5)}, "6 harmonics; allowed are 1, 4, 9, 16"),
     ],
 )
-def test_checkpoints_that_do_not_fit_are_refused(plain, tmp_path, parts, reason):
+def test_inconsistent_checkpoints_are_refused(plain, tmp_path, parts, reason):
     world, options = plain
     with pytest.raises(CheckpointError, match=reason) as refused:
         imported(world, options, tmp_path, **parts)
     assert "iteration_50000.pth" in str(refused.value)
 
 
-def test_corrections_of_another_size_are_refused(plain, tmp_path):
+def test_corrections_with_a_wrong_shape_are_refused(plain, tmp_path):
     world, options = plain
     params = {"opt_trans": torch.zeros(4, 9, 3), "opt_rots": torch.zeros(4, 9, 1)}
     with pytest.raises(CheckpointError, match=r"'opt_trans' is \[4, 9, 3\], not \[4, 2, 3\]"):
@@ -259,7 +259,7 @@ def test_corrections_of_another_size_are_refused(plain, tmp_path):
         ({"tracker": True}, "track_info_castrack.txt: cannot be read"),
     ],
 )
-def test_options_that_do_not_fit_are_refused(plain, tmp_path, change, reason):
+def test_mismatched_options_are_refused(plain, tmp_path, change, reason):
     world, options = plain
     with pytest.raises(CheckpointError, match=reason):
         imported(world, replace(options, **change), tmp_path)
@@ -286,14 +286,14 @@ def test_options_that_do_not_fit_are_refused(plain, tmp_path, change, reason):
         ("track/track_camera_vis.json", "{}", "says nothing of track 7 in frame 2"),
     ],
 )
-def test_dataset_folders_that_do_not_fit_are_refused(plain, tmp_path, name, text, reason):
+def test_malformed_dataset_files_are_refused(plain, tmp_path, name, text, reason):
     world, options = plain
     (options.dataset / name).write_text(text)
     with pytest.raises(CheckpointError, match=reason):
         imported(world, options, tmp_path)
 
 
-def test_time_stamps_must_increase(plain, tmp_path):
+def test_timestamps_must_increase(plain, tmp_path):
     world, options = plain
     stamps = {f"{f:06d}": 5.0 for f in range(16)}
     (options.dataset / "timestamps.json").write_text(json.dumps({"FRAME": stamps}))

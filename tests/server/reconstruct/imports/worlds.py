@@ -1,4 +1,4 @@
-"""Checkpoints and dataset folders of other systems in small, made after their descriptions."""
+"""Small checkpoints and dataset folders in the formats of other systems."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def pose(x: float, y: float, z: float, yaw: float) -> np.ndarray:
 
 
 def write_matrix(file: Path, values: Any) -> None:
-    """Numbers as text, a row a line."""
+    """Write a matrix as text, one row per line."""
     rows = np.atleast_2d(np.asarray(values, dtype=float)).tolist()
     file.write_text("\n".join(" ".join(map(repr, row)) for row in rows) + "\n")
 
@@ -42,7 +42,7 @@ def street_model(count: int, *, harmonics: int = 3, fourier: int = 1, seed: int 
 
 
 def opengl_direction(face: int, x: float, y: float) -> np.ndarray:
-    """Where a pixel at (x right, y down) in [-1, 1] of a face looks; as ``cube_to_dir`` says."""
+    """View direction of a face pixel at (x right, y down) in [-1, 1], as in ``cube_to_dir``."""
     direction = [
         (1, -y, -x),
         (-1, -y, x),
@@ -55,7 +55,7 @@ def opengl_direction(face: int, x: float, y: float) -> np.ndarray:
 
 
 def direction_cube(resolution: int) -> torch.Tensor:
-    """A cube map [6, R, R, 3] whose colour says where a pixel looks: (direction + 1) / 2."""
+    """A cube map [6, R, R, 3] with colours (direction + 1) / 2."""
     faces = np.zeros((6, resolution, resolution, 3), dtype=np.float32)
     for face, row, column in np.ndindex(6, resolution, resolution):
         x, y = ((c + 0.5) / resolution * 2 - 1 for c in (column, row))
@@ -65,10 +65,10 @@ def direction_cube(resolution: int) -> torch.Tensor:
 
 @dataclass
 class StreetWorld:
-    """A folder of 16 frames; a model trained on 10 to 13 with cameras 0 and 1.
+    """A folder of 16 frames, and a model trained on frames 10 to 13 with cameras 0 and 1.
 
-    Rows of ``track_info.txt`` by frame and in order. Track 5 stands; 7, 3, 8 (and 1) move; 9 is a
-    sign; 3 is seen in frame 12 by camera 4 only.
+    ``rows`` holds the tracks of ``track_info.txt`` by frame, in file order. Track 5 is parked;
+    7, 3, 8 (and 1) move; 9 is a sign. In frame 12 only camera 4 sees track 3.
     """
 
     rows: dict[int, list[int]] = field(
@@ -81,7 +81,7 @@ class StreetWorld:
         }
     )
     columns: dict[tuple[int, int], int] = field(
-        # Without track 5 two columns are enough, so tracks move up.
+        # Without track 5 two columns suffice, so the tracks are packed.
         default_factory=lambda: {
             (10, 7): 0,
             (10, 3): 1,
@@ -98,7 +98,7 @@ class StreetWorld:
 
     @classmethod
     def with_gaps(cls) -> StreetWorld:
-        """Frame 11 needs all three columns, so those of track 5 stay empty elsewhere."""
+        """A world whose frame 11 needs all three columns, so the columns of track 5 stay empty."""
         rows = {2: [7], 10: [5, 7, 9, 3], 11: [7, 1, 3], 12: [3, 5, 8, 7], 13: [5, 1, 8]}
         columns = {
             (10, 7): 1,
@@ -118,7 +118,7 @@ class StreetWorld:
         return sorted({track for _, track in self.columns})
 
     def ego(self, frame: int) -> np.ndarray:
-        """In Waymo's world, far from its origin."""
+        """Pose of the ego in Waymo's world frame, far from the origin."""
         return pose(-25_211.0 + 3 * frame, 42_391.0 + frame, 7.5 + 0.01 * frame, 0.3 + 0.02 * frame)
 
     def centre(self) -> np.ndarray:
@@ -130,7 +130,7 @@ class StreetWorld:
         return moved
 
     def given_in_vehicle(self, frame: int, track: int) -> tuple[np.ndarray, float]:
-        """Position and heading of a box as the folder gives them."""
+        """Position and heading of a box in the vehicle frame, as stored in the folder."""
         if track == 5:
             local = np.linalg.inv(self.ego(frame)) @ pose(-25_190, 42_410, 8, 1.0)
             return local[:3, 3], math.atan2(local[1, 0], local[0, 0])
@@ -138,11 +138,11 @@ class StreetWorld:
         return position, 0.1 * track + 0.05 * frame
 
     def correction(self, frame: int, track: int) -> tuple[np.ndarray, float]:
-        """Shift and theta that training found."""
+        """Trained correction: shift [m] and theta [rad]."""
         return np.array([0.1, -0.2, 0.05]) * track + 0.01 * frame, 0.01 * track - 0.002 * frame
 
     def pose_in_scene(self, frame: int, track: int) -> np.ndarray:
-        """Where an object is in the end; theta counts twice."""
+        """Corrected pose of an object in the scene. Theta is applied twice."""
         position, heading = self.given_in_vehicle(frame, track)
         shift, theta = self.correction(frame, track)
         x, y, z = position + shift
@@ -160,7 +160,7 @@ class StreetWorld:
         for frame in range(16):
             write_matrix(folder / "ego_pose" / f"{frame:06d}.txt", self.ego(frame))
             for camera in range(5):
-                # Of the moment of each image; not to be taken for the frame's.
+                # Poses at the image times, which must not be used as frame poses.
                 late = self.ego(frame) @ pose(0.3, 0, 0, 0.001)
                 write_matrix(folder / "ego_pose" / f"{frame:06d}_{camera}.txt", late)
         for camera in range(5):
@@ -192,7 +192,7 @@ class StreetWorld:
         (place / "track_camera_vis.json").write_text(json.dumps(seen))
 
     def state(self, **parts: Any) -> dict[str, Any]:
-        """A checkpoint; ``parts`` replace or add, None leaves out."""
+        """A checkpoint. ``parts`` replace or add entries; None removes them."""
         shift = torch.zeros(len(self.frames), self.width, 3)
         theta = torch.zeros(len(self.frames), self.width, 1)
         for (frame, track), column in self.columns.items():
@@ -225,14 +225,14 @@ def studio_model(
 
 
 def studio_state(**models: Any) -> dict[str, Any]:
-    """A drivestudio checkpoint of 5 frames and 3 instances; the last is never visible."""
+    """A drivestudio checkpoint: 5 frames, 3 instances, the last of which is never visible."""
     rigid = studio_model(24, seed=3)
     quats, positions = torch.zeros(5, 3, 4), torch.zeros(5, 3, 3)
     visible = torch.zeros(5, 3, dtype=torch.bool)
     for frame in range(5):
         for instance in range(3):
             yaw = 0.3 * instance + 0.1 * frame
-            # Of any length, as trained parameters are.
+            # Not normalized, like trained parameters.
             quats[frame, instance] = 1.7 * torch.tensor(
                 [math.cos(yaw / 2), 0, 0, math.sin(yaw / 2)]
             )

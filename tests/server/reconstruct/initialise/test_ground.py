@@ -18,7 +18,7 @@ def road() -> GroundFit:
     return fit_ground(points, path, BoxBottoms(np.zeros((0, 3)), np.zeros((0, 4, 2))))
 
 
-def test_ground_points_lie_on_the_surface_and_keep_to_the_limit():
+def test_ground_points_lie_on_the_surface_within_the_limit():
     fitted = road()
     spread = spread_ground(fitted, 0.1, 20_000)
     assert 5_000 < len(spread.points) <= 20_000
@@ -27,7 +27,7 @@ def test_ground_points_lie_on_the_surface_and_keep_to_the_limit():
     assert spread.normals[:, 2].min() > 0.9
 
 
-def test_no_two_ground_points_share_a_place():
+def test_ground_points_are_unique():
     fitted = road()
     points = spread_ground(fitted, 0.1, 1_000_000).points
     assert len(np.unique(np.round(points[:, :2] / 0.01), axis=0)) == len(points)

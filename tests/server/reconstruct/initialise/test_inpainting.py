@@ -1,4 +1,4 @@
-"""Colours of what no camera saw."""
+"""Colours of unobserved surfaces."""
 
 import numpy as np
 
@@ -17,12 +17,12 @@ def noisy(colour, count, seed=0):
     return (colour + rng.normal(0, 0.02, (count, 3))).astype(np.float32)
 
 
-def test_the_commonest_colour_is_not_the_mean():
+def test_modal_colour_is_the_most_common_colour():
     colours = np.concatenate([noisy(WHITE, 300), noisy(RED, 200, 1)])
     assert np.abs(modal_colour(colours) - WHITE).max() < 0.02
 
 
-def test_lamps_do_not_colour_the_rest_of_a_body():
+def test_lamps_do_not_affect_the_body_colour():
     colours = np.concatenate([noisy(WHITE, 100), noisy(RED, 60, 1), np.zeros((50, 3), np.float32)])
     known = np.arange(len(colours)) < 160
     heights = np.full(len(colours), 0.1, np.float32)
@@ -30,7 +30,7 @@ def test_lamps_do_not_colour_the_rest_of_a_body():
     assert np.abs(paint[~known] - WHITE).max() < 0.03
 
 
-def test_bands_of_height_have_their_own_paint():
+def test_height_bands_have_separate_colours():
     colours = np.concatenate([noisy(DARK, 100), noisy(WHITE, 200, 1)])
     heights = np.repeat(np.float32([-0.45, 0.1]), [100, 200])
     known = np.ones(300, bool)
@@ -39,13 +39,13 @@ def test_bands_of_height_have_their_own_paint():
     assert np.abs(paint[-1] - WHITE).max() < 0.03
 
 
-def test_of_an_object_that_was_hardly_seen_the_prior_remains():
+def test_an_object_with_few_samples_keeps_the_prior():
     colours, prior = noisy(WHITE, 10), np.tile(RED, (10, 1))
     known = np.arange(10) < 5
     assert (body_color(np.zeros(10, np.float32), colours, known, prior, EDGES) == prior).all()
 
 
-def test_a_shorter_reach_leaves_more_to_the_prior():
+def test_a_shorter_trust_reach_favours_the_prior():
     points = np.float32([[0, 0, 0], [0.5, 0, 0]])
     colours = np.stack([RED, np.zeros(3, np.float32)])
     known, prior = np.array([True, False]), np.stack([WHITE, WHITE])

@@ -16,7 +16,7 @@ def cloud_of(seed: int, count: int) -> PointSet:
 @given(seed=st.integers(0, 999), count=st.integers(1, 400), voxel=st.floats(0.05, 3))
 def test_thinning_leaves_at_most_one_point_in_a_voxel(seed, count, voxel):
     thinned = thin(cloud_of(seed, count), voxel)
-    # A mean can be rounded onto the border of its voxel, hence the hair's breadth.
+    # Rounding can move a mean onto the border of its voxel, hence the tolerance.
     cells = np.floor(thinned.points.astype(np.float64) / voxel + 1e-4)
     others = np.floor(thinned.points.astype(np.float64) / voxel - 1e-4)
     inside = (cells == others).all(axis=1)
@@ -43,7 +43,7 @@ def test_thinning_moves_no_point_farther_than_its_voxel(seed, voxel):
     assert distance.max() <= voxel * 3**0.5 + 1e-4
 
 
-def test_thinning_does_not_depend_on_the_order_of_points_beyond_rounding():
+def test_thinning_depends_on_point_order_only_by_rounding():
     cloud = cloud_of(3, 500)
     shuffled = cloud.select(np.random.default_rng(0).permutation(500))
     np.testing.assert_allclose(thin(cloud, 0.5).points, thin(shuffled, 0.5).points, atol=1e-5)
@@ -54,11 +54,11 @@ def test_points_of_different_levels_are_never_merged():
     assert len(thin(cloud, 1.0, np.array([0, 1]))) == 2
 
 
-def test_thinning_to_a_limit_stays_within_it():
+def test_thinning_respects_the_limit():
     assert 0 < len(thin_to(cloud_of(0, 5000), 0.01, 200)) <= 200
 
 
-def test_thinning_nothing_gives_nothing():
+def test_thinning_an_empty_set_gives_an_empty_set():
     assert len(thin(PointSet.join([]), 0.1)) == 0
 
 

@@ -15,7 +15,7 @@ NONE, ALL = (np.full((64, 64), value) for value in (False, True))
 
 
 def view(grey: int, *, covered: bool = False) -> ProjectedView:
-    """One straight ahead, of a single colour."""
+    """A uniformly coloured view straight ahead."""
     depth = np.full((32, 32), 20.0 if covered else np.inf, np.float32)
     image = np.full((64, 64, 3), grey, np.uint8)
     nothing = np.zeros((32, 32), np.bool_)
@@ -23,13 +23,13 @@ def view(grey: int, *, covered: bool = False) -> ProjectedView:
 
 
 def ahead(samples: SkySamples) -> float:
-    """Grey of the sky straight ahead, 0 to 255."""
+    """Grey level of the sky straight ahead, 0 to 255."""
     faces = samples.finish(np.zeros(3, np.float32)).faces
     return float(faces[0, 8, 8, 0]) * 255
 
 
 @pytest.mark.parametrize("first", [0, 1])
-def test_the_sky_of_one_view_wins_over_a_tree_without_gaussians_of_others(first):
+def test_masked_sky_samples_take_precedence(first):
     seen = [(view(WHITE, covered=True), ALL), (view(TREE), NONE), (view(TREE), NONE)]
     samples = SkySamples(16)
     for one, sky in seen[first:] + seen[:first]:
@@ -37,7 +37,7 @@ def test_the_sky_of_one_view_wins_over_a_tree_without_gaussians_of_others(first)
     assert ahead(samples) == pytest.approx(WHITE, abs=1)
 
 
-def test_without_a_mask_what_no_gaussian_covers_is_taken():
+def test_without_a_mask_uncovered_pixels_are_sampled():
     samples = SkySamples(16)
     samples.add(view(WHITE, covered=True), NONE)
     samples.add(view(TREE), NONE)

@@ -38,7 +38,7 @@ def colours_of(cloud) -> np.ndarray:
     return (cloud.sh[:, 0].numpy() * SH_C0 + 0.5) * 255
 
 
-def test_every_track_becomes_an_object_with_its_box_and_path(synthetic_log, synthetic_scene):
+def test_every_track_becomes_an_object_with_its_box_and_trajectory(synthetic_log, synthetic_scene):
     assert list(synthetic_scene.objects) == [t.object_id for t in synthetic_log.tracks]
     for track in synthetic_log.tracks:
         item = synthetic_scene.object(track.object_id)
@@ -54,7 +54,7 @@ def test_gaussians_of_objects_lie_inside_their_enlarged_boxes(synthetic_scene):
         assert outside.max() <= SMALL.box_margin + 1e-3, item.object_id
 
 
-def test_background_keeps_nothing_of_moving_cars(synthetic_log, synthetic_scene):
+def test_the_background_excludes_moving_cars(synthetic_log, synthetic_scene):
     movers = [t for t in synthetic_log.tracks if np.ptp(t.trajectory.positions, axis=0).max() > 1]
     assert movers
     means = synthetic_scene.background.means.numpy()
@@ -68,18 +68,18 @@ def test_background_keeps_nothing_of_moving_cars(synthetic_log, synthetic_scene)
             assert not ((np.abs(local) < half).all(axis=1) & above_ground).any(), track.object_id
 
 
-def test_values_are_fit_for_a_bundle(synthetic_scene):
+def test_scene_values_are_valid_for_a_bundle(synthetic_scene):
     synthetic_scene.background.check_values("background")
     for item in synthetic_scene.objects.values():
         item.cloud.check_values(item.object_id)
     assert torch.isfinite(synthetic_scene.sky.faces).all()
 
 
-def test_budgets_are_kept(synthetic_log):
+def test_gaussian_budgets_are_respected(synthetic_log):
     options = replace(SMALL, max_background=5_000, max_object=500)
     scene = initialise_scene(synthetic_log, options=options)
     assert len(scene.background) <= 5_000
-    # The underside of a vehicle comes on top of its measured body.
+    # The generated body of a vehicle adds to its measured points.
     assert all(len(o.cloud) <= 500 + 6_000 for o in scene.objects.values())
 
 
@@ -89,7 +89,7 @@ def test_rendered_views_come_close_to_the_logged_images(synthetic_log, synthetic
     assert report.psnr > 13
 
 
-def test_the_same_log_gives_the_same_bits(painted_scene):
+def test_initialisation_is_reproducible(painted_scene):
     again = initialise_scene(painted_log(), options=SMALL)
     assert torch.equal(again.sky.faces, painted_scene.sky.faces)
     for name in ("means", "quats", "scales", "opacities", "sh"):
@@ -108,7 +108,7 @@ def test_a_wall_behind_a_passing_box_keeps_its_own_colour(painted_scene):
     assert (error < 25).mean() > 0.99
 
 
-def test_the_front_of_the_box_has_the_colour_of_the_box(painted_scene):
+def test_the_near_face_of_the_box_has_its_colour(painted_scene):
     cloud = painted_scene.object("other_1").cloud
     front = cloud.means[:, 0].numpy() < -BOX_SIZE[0] / 2 + 0.05
     inner = front & (np.abs(cloud.means[:, 1:].numpy()) < [0.85, 0.65]).all(axis=1)
@@ -116,7 +116,7 @@ def test_the_front_of_the_box_has_the_colour_of_the_box(painted_scene):
     assert (error < 25).mean() > 0.97
 
 
-def test_taking_the_box_away_shows_the_wall(painted_scene):
+def test_removing_the_box_reveals_the_wall(painted_scene):
     from real2sim_server.reconstruct.evaluation import render_logged_view
 
     log = painted_log()
@@ -129,7 +129,7 @@ def test_taking_the_box_away_shows_the_wall(painted_scene):
     assert error < 20
 
 
-def test_the_sky_is_taken_from_pixels_that_nothing_covers(painted_scene):
+def test_the_sky_has_the_colour_of_uncovered_pixels(painted_scene):
     up = torch.tensor([[1.0, 0.0, 0.38]])
     colour = painted_scene.sky.sample(up)[0].numpy() * 255
     np.testing.assert_allclose(colour, SKY_COLOUR, atol=12)
@@ -141,7 +141,7 @@ def test_a_log_without_boxes_becomes_a_scene_without_objects():
     assert len(scene.background) > 1000
 
 
-def test_a_log_without_lidar_that_never_moves_is_refused():
+def test_a_stationary_log_without_lidar_is_refused():
     with pytest.raises(ReconstructError, match="no usable LiDAR points, and its images"):
         initialise_scene(painted_log(lidar=False), options=SMALL)
 
@@ -151,7 +151,7 @@ def test_a_log_without_cameras_is_refused():
         initialise_scene(replace(painted_log(), rig=CameraRig(())), options=SMALL)
 
 
-def test_progress_names_the_stages_and_ends_each():
+def test_progress_reports_every_stage_to_its_end():
     reported: list[tuple[str, int, int]] = []
     timing: dict[str, float] = {}
     initialise_scene(

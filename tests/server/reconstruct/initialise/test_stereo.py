@@ -22,26 +22,26 @@ def points() -> np.ndarray:
     return swept(textured_log())
 
 
-def test_a_textured_wall_is_found_densely_where_it_stands(points):
+def test_a_textured_wall_is_reconstructed_densely(points):
     assert len(points) > 20_000
-    # Planes are half a metre apart there.
+    # Planes are 0.5 m apart at this depth.
     error = np.abs(points[:, 0] - WALL_X)
     assert np.median(error) < 0.4
     assert np.quantile(error, 0.9) < 0.8
 
 
-def test_no_point_is_taken_of_a_box_that_moves(points):
+def test_moving_boxes_give_no_points(points):
     with_box = swept(textured_log(box=True))
     assert (np.abs(with_box[:, 0] - BOX_X) < 1.5).mean() < 0.005
     assert len(with_box) < len(points)
 
 
-def test_one_image_or_none_gives_no_point():
+def test_fewer_than_two_images_give_no_points():
     assert swept(textured_log(), images=0).shape == (0, 3)
     assert len(swept(textured_log(), images=1)) == 0
 
 
-def test_points_are_sought_above_the_highest_returns_of_lidar(points):
+def test_points_lie_above_the_highest_lidar_returns(points):
     log = textured_log()
     y, z = np.meshgrid(np.linspace(-5, 5, 60), np.linspace(0.2, 1.6, 20))
     low = np.stack([np.full(y.size, WALL_X), y.ravel(), z.ravel()], 1)
@@ -59,7 +59,7 @@ def test_points_are_sought_above_the_highest_returns_of_lidar(points):
     assert above[:, 2].min() > 1.0
 
 
-def test_a_log_without_lidar_is_built_of_swept_points_alone():
+def test_a_log_without_lidar_is_initialised_from_stereo_points():
     options = InitialiseOptions(max_background=8_000, feature_images=0)
     means = initialise_scene(textured_log(), options=options).background.means
     assert int(((means[:, 0] - WALL_X).abs() < 0.5).sum()) > 500

@@ -17,7 +17,7 @@ def inner(points: np.ndarray) -> np.ndarray:
     return ((fraction > 0.2) & (fraction < 0.8)).all(axis=1)
 
 
-def test_gaussians_on_a_plane_lie_flat_on_it():
+def test_gaussians_on_a_plane_are_flat():
     points = grid(0.1, 0.1)
     surfels = fit_surfels(points, largest=1.0, smallest=0.001)
     assert np.abs(surfels.normals[:, 2]).min() > 0.999
@@ -31,7 +31,7 @@ def test_axes_are_right_handed_rotations():
     np.testing.assert_allclose(np.linalg.det(axes), 1, atol=1e-5)
 
 
-def test_gaussians_stretch_across_scan_lines_and_not_along_them():
+def test_gaussians_stretch_across_scan_lines():
     points = grid(0.1, 0.3)
     surfels = fit_surfels(points, largest=1.0)
     covariance = np.einsum("nij,nj,nkj->nik", surfels.axes, surfels.scales**2, surfels.axes)
@@ -41,7 +41,7 @@ def test_gaussians_stretch_across_scan_lines_and_not_along_them():
     assert np.median(across[middle]) == pytest.approx(0.18, rel=0.2)
 
 
-def test_the_gaps_of_a_surface_close():
+def test_surfels_close_gaps_in_a_surface():
     points = grid(0.1, 0.2)
     surfels = fit_surfels(points, largest=1.0)
     covariance = np.einsum("nij,nj,nkj->nik", surfels.axes, surfels.scales**2, surfels.axes)
@@ -61,7 +61,7 @@ def test_scales_stay_within_their_bounds():
 
 
 @pytest.mark.parametrize("count", [0, 1, 3])
-def test_a_handful_of_points_becomes_round_gaussians(count):
+def test_few_points_become_isotropic_gaussians(count):
     points = np.arange(3 * count, dtype=np.float32).reshape(count, 3)
     surfels = fit_surfels(points, largest=0.2)
     assert (surfels.scales == np.float32(0.2)).all()

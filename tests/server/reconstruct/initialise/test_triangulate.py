@@ -24,7 +24,7 @@ BOX_SIZE, BOX_X = (0.5, 3.0, 3.0), 9.0
 
 @dataclass(frozen=True)
 class TexturedSource:
-    """A wall of coloured squares ahead of a vehicle, and a box that moves before it."""
+    """A wall of random squares ahead of a vehicle, and a box that moves in front of it."""
 
     camera: Camera
     box: bool
@@ -90,30 +90,30 @@ def wall() -> TriangulatedPoints:
     return points_of(textured_log())
 
 
-def test_points_of_a_wall_lie_on_it_as_closely_as_they_say(wall):
+def test_point_errors_match_their_stated_deviation(wall):
     error = np.abs(wall.points[:, 0] - WALL_X)
     assert len(wall) > 100
     assert np.median(error / wall.deviation) < 1
     assert np.percentile(error, 95) < RELATIVE_ERROR * WALL_X
 
 
-def test_points_are_seen_by_three_images_or_more(wall):
+def test_points_are_seen_in_at_least_three_images(wall):
     assert wall.sightings.min() >= 3
     assert wall.sightings.max() == FRAMES
 
 
-def test_what_moves_in_a_box_gives_no_points():
+def test_moving_boxes_give_no_points():
     found = points_of(textured_log(box=True)).points
     assert len(found) > 50
     assert found[:, 0].min() > BOX_X + 1
 
 
-def test_the_same_log_gives_the_same_bits(wall):
+def test_triangulation_is_reproducible(wall):
     again = points_of(textured_log())
     assert np.array_equal(again.points, wall.points)
 
 
-def test_a_vehicle_that_stands_still_tells_no_depth():
+def test_a_stationary_vehicle_gives_no_points():
     log = textured_log()
     still = Trajectory.from_transforms(log.frame_times_us, np.tile(np.eye(4), (FRAMES, 1, 1)))
     assert len(points_of(replace(log, ego=still))) == 0
@@ -123,13 +123,13 @@ def test_no_images_give_no_points():
     assert len(points_of(textured_log(), max_images=0)) == 0
 
 
-def test_progress_counts_images_up_to_their_number():
+def test_progress_counts_images():
     seen = []
     points_of(textured_log(), max_images=4, on_image=lambda done, total: seen.append((done, total)))
     assert seen == [(1, 4), (2, 4), (3, 4), (4, 4)]
 
 
-def test_a_log_without_lidar_becomes_a_scene_of_what_was_triangulated():
+def test_a_log_without_lidar_is_initialised_from_triangulated_points():
     log = textured_log(box=True)
     scene = initialise_scene(log, options=InitialiseOptions(ground_spacing=0.5))
     wall = scene.background.means[:, 0].numpy()

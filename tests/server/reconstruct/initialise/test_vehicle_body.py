@@ -15,14 +15,14 @@ SALOON, ESTATE = (4.7, 1.82, 1.46), (4.65, 1.84, 1.68)
 
 
 def near(body, place) -> Part:
-    """The part nearest to a place."""
+    """The part nearest to a position."""
     return Part(body.parts_near(np.array([place], np.float32))[1][0])
 
 
-def test_measured_points_choose_the_shape_of_a_car():
+def test_measured_points_determine_the_car_shape():
     wagon = fitted_body(np.zeros((0, 3), np.float32), ESTATE, "car")
     rear = wagon.points[wagon.points[:, 0] < -1.0].astype(np.float32)
-    # In a box as long and as low as a saloon's, still its own roof line.
+    # Squeezed into a saloon's box, the rear keeps its estate roof line.
     squeezed = (rear * np.array(SALOON) / ESTATE).astype(np.float32)
     found = fitted_body(squeezed, SALOON, "car")
     other = fitted_body(np.zeros((0, 3), np.float32), SALOON, "car")
@@ -31,7 +31,7 @@ def test_measured_points_choose_the_shape_of_a_car():
     assert gap[0] < 0.15 < gap[1]
 
 
-def test_glass_tyres_and_lamps_are_no_paint():
+def test_glass_tyres_and_lamps_are_separate_parts():
     body = fitted_body(np.zeros((0, 3), np.float32), SALOON, "car")
     assert near(body, (0.3, 0.75, 0.35)) is Part.GLASS
     assert near(body, (0.3 * 4.7, 0.9, -0.73 + 0.03)) is Part.TYRE
@@ -39,20 +39,20 @@ def test_glass_tyres_and_lamps_are_no_paint():
     assert near(body, (0.0, 0.9, -0.1)) is Part.PAINT
 
 
-def test_side_windows_are_parted_by_dark_pillars_and_framed():
+def test_side_windows_have_dark_pillars():
     body = fitted_body(np.zeros((0, 3), np.float32), SALOON, "car")
     window = (body.points[:, 1] > 0.6) & (np.abs(body.points[:, 2] - 0.36) < 0.1)
     along = np.round(body.points[window, 0] / 0.1) * 0.1
     dark = [(body.parts[window][along == x] == Part.TRIM).mean() for x in np.unique(along)]
     inner = np.unique(along)
     pillars = [x for x, share in zip(inner, dark, strict=True) if share > 0.3 and -1.2 < x < 0.6]
-    # Two of them: at a third and at two thirds of the glass.
+    # Two pillars, at one and two thirds of the glass.
     glass = np.array([-0.31, 0.19]) * SALOON[0]
     for k in (1, 2):
         assert np.abs(np.array(pillars) - (glass[0] + k * np.diff(glass)[0] / 3)).min() < 0.1
 
 
-def test_the_rim_has_dark_gaps_between_its_spokes():
+def test_wheels_have_a_tyre_and_a_rim_with_spokes():
     angle = np.linspace(0, 2 * np.pi, 200)
     ring = wheel_parts(0.45 * np.stack([np.cos(angle), np.sin(angle)], axis=1))
     changes = (ring != np.roll(ring, 1)).sum()
@@ -64,7 +64,7 @@ def test_the_rim_has_dark_gaps_between_its_spokes():
 def test_normals_point_outwards(shape):
     body = fitted_body(np.zeros((0, 3), np.float32), shape.size, shape.category)
     outer = body.points / (np.array(shape.size) / 2)
-    # What lies on the outside of the box, away from its edges, faces away from its middle.
+    # Surfaces on the outside of the box, away from its edges, face outwards.
     on_side = (np.abs(outer[:, 1]) > 0.93) & (np.abs(outer[:, 2]) < 0.5)
     wheel = (body.parts == Part.TYRE) | (body.parts == Part.RIM)
     hub = wheel & (np.abs(outer[:, 1]) > 0.95)
@@ -73,19 +73,19 @@ def test_normals_point_outwards(shape):
     assert (np.sign(body.normals[hub, 1]) == np.sign(outer[hub, 1])).mean() > 0.9
 
 
-def test_few_wide_discs_leave_no_gap_in_what_is_flat():
+def test_sparse_wide_discs_leave_no_gaps():
     body = fitted_body(np.zeros((0, 3), np.float32), SALOON, "car")
     drawn = body.drawn > 0
     assert drawn.mean() < 0.65
     np.testing.assert_allclose(np.unique(body.drawn[drawn]), [0.05, 0.12])
     distance = cKDTree(body.points[drawn]).query(body.points)[0]
     assert distance.max() < 0.15
-    # Where parts meet all points are drawn, or their edges would blur.
+    # All points are drawn where parts meet, to keep edges sharp.
     lamp = body.parts == Part.RED_LAMP
     assert (body.drawn[lamp] == np.float32(0.05)).mean() > 0.7
 
 
-def test_a_trucks_cargo_has_a_paint_of_its_own():
+def test_truck_cargo_has_its_own_colour():
     truck = next(s for s in SHAPES if s.category == "truck")
     body = fitted_body(np.zeros((0, 3), np.float32), truck.size, "truck")
     behind, ahead = (-0.15 * truck.size[0], 1.19, 0.5), (0.31 * truck.size[0], 1.1, -0.5)
@@ -101,7 +101,7 @@ def test_a_trucks_cargo_has_a_paint_of_its_own():
         np.testing.assert_allclose(mine, np.tile(paint, (len(mine), 1)), atol=0.02)
 
 
-def test_the_dark_plate_under_a_vehicle_is_not_its_paint():
+def test_the_dark_underside_does_not_affect_the_paint():
     body = fitted_body(np.zeros((0, 3), np.float32), SALOON, "car")
     few = body.points[body.is_paint][::40].astype(np.float32)
     plate = np.random.default_rng(0).uniform(-1, 1, (2000, 3)) * (2.2, 0.8, 0) - (0, 0, 1.2)
@@ -116,12 +116,12 @@ def test_the_dark_plate_under_a_vehicle_is_not_its_paint():
     np.testing.assert_allclose(found[body.is_paint], 0.6, atol=0.02)
 
 
-def test_other_categories_and_odd_boxes_have_no_body():
+def test_other_categories_and_unusual_boxes_have_no_body():
     assert fitted_body(np.zeros((0, 3), np.float32), (0.6, 0.6, 1.7), "pedestrian") is None
     assert fitted_body(np.zeros((0, 3), np.float32), (9.0, 1.8, 1.5), "car") is None
 
 
-def test_a_body_fills_where_nothing_was_measured():
+def test_a_body_fills_unmeasured_parts():
     from real2sim_server.reconstruct.initialise.vehicle_body import complete_body
 
     body = fitted_body(np.zeros((0, 3), np.float32), SALOON, "car")
@@ -133,7 +133,7 @@ def test_a_body_fills_where_nothing_was_measured():
     assert np.abs(ahead[:, 1]).max() < SALOON[1] / 2
 
 
-def test_of_a_box_ahead_only_the_side_towards_the_camera_is_faced():
+def test_only_surfaces_towards_the_camera_are_faced():
     log = painted_log()
     track = log.tracks[0]
     half = np.array(track.size) / 2

@@ -1,4 +1,4 @@
-"""Paint and light of vehicles: what one side says of the others, and other vehicles of one."""
+"""Paint and lighting of vehicles, inferred from observed sides and from other vehicles."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def body():
 
 
 def surface(body, paint, *, light, seen_from=(-1, 0, 0), turned=0.0) -> VehicleSurface:
-    """A car in one paint, its box turned [rad], seen from one side of it."""
+    """A car of one paint, rotated by ``turned`` [rad] and observed from one side."""
     c, s = np.cos(turned), np.sin(turned)
     normals = body.unit_normals() @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T
     colours = (paint * brightness(light, normals)).astype(np.float32)
@@ -49,7 +49,7 @@ def doors(body) -> np.ndarray:
     return body.is_paint & (np.abs(body.points[:, 0]) < 1) & (np.abs(body.points[:, 2]) < 0.2)
 
 
-def test_light_is_found_on_vehicles_of_different_paints_that_stand_differently(body):
+def test_light_is_fitted_from_vehicles_of_different_paint_and_heading(body):
     cars = [
         surface(body, paint, light=LIGHT, turned=turned, seen_from=side)
         for paint, turned, side in (
@@ -64,7 +64,7 @@ def test_light_is_found_on_vehicles_of_different_paints_that_stand_differently(b
         [c.normals[p] for c, p in zip(cars, painted, strict=True)],
         [c.colours[p] for c, p in zip(cars, painted, strict=True)],
     )
-    # Light from above is believed until vehicles say otherwise.
+    # The prior (light from above) biases the fit.
     np.testing.assert_allclose(found, LIGHT, atol=0.06)
 
 
@@ -72,7 +72,7 @@ def test_without_vehicles_light_comes_from_above():
     np.testing.assert_array_equal(fit_light([], []), FROM_ABOVE)
 
 
-def test_a_flank_that_no_camera_saw_is_even_and_in_the_colour_of_the_tail(body):
+def test_an_unobserved_flank_has_the_uniform_colour_of_the_tail(body):
     dark = np.zeros(3)
     [filled], _, _ = fill_vehicles([surface(body, GREEN, light=dark)])
     flank = filled[doors(body)]
@@ -80,7 +80,7 @@ def test_a_flank_that_no_camera_saw_is_even_and_in_the_colour_of_the_tail(body):
     np.testing.assert_allclose(flank.mean(0) / flank.mean(), GREEN / GREEN.mean(), atol=0.1)
 
 
-def test_the_mirrored_flank_has_the_light_of_its_own_side(body):
+def test_a_mirrored_flank_is_relit_for_its_side(body):
     towards = np.array([0.0, 0.8, 0.0])
     left = surface(body, GREEN, light=towards, seen_from=(0, 1, 0))
     cars = [left, *(surface(body, GREEN, light=towards, seen_from=(0, s, 0)) for s in (-1, 1) * 4)]
@@ -91,7 +91,7 @@ def test_the_mirrored_flank_has_the_light_of_its_own_side(body):
     assert bright < np.exp(-2 * 0.8 * 0.5)
 
 
-def test_a_vehicle_that_was_never_seen_is_grey_and_as_bright_as_the_others(body):
+def test_an_unobserved_vehicle_is_grey_with_average_brightness(body):
     dark = np.zeros(3)
     hidden = surface(body, GREEN, light=dark)
     hidden = VehicleSurface(
@@ -108,7 +108,7 @@ def test_a_vehicle_that_was_never_seen_is_grey_and_as_bright_as_the_others(body)
     assert np.isfinite(light).all()
 
 
-def test_glass_is_as_dark_as_the_logs_own(body):
+def test_glass_colour_is_learnt_from_the_log(body):
     dark, black = np.zeros(3), np.full(3, 0.04, np.float32)
 
     def glazed(seen: bool) -> VehicleSurface:
@@ -121,19 +121,19 @@ def test_glass_is_as_dark_as_the_logs_own(body):
     filled, _, palette = fill_vehicles([glazed(True)] * 8 + [glazed(False)])
     usual = default_palette()
     assert palette[Part.GLASS].max() < 0.1 < usual[Part.GLASS].min()
-    # A vehicle whose glass nobody saw has the others'; lamps, lit or not, are never learnt.
+    # A vehicle with unobserved glass gets the glass of the others. Lamp colours are not learnt.
     glass = filled[-1][body.parts == Part.GLASS]
     np.testing.assert_allclose(glass.mean(0), palette[Part.GLASS], rtol=0.3)
     np.testing.assert_array_equal(palette[Part.RED_LAMP], usual[Part.RED_LAMP])
 
 
-def test_a_scene_without_colours_of_parts_has_the_usual_ones():
+def test_a_scene_without_part_colours_uses_the_defaults():
     np.testing.assert_array_equal(palette_of(None), default_palette())
     kept = default_palette() * 0.5
     np.testing.assert_allclose(palette_of({PARTS: kept.tolist()}), kept)
 
 
-def test_light_turns_with_the_vehicle_and_comes_from_above_where_none_is_known():
+def test_light_is_rotated_to_the_vehicle_frame_or_comes_from_above():
     times = np.array([0, 1_000_000])
     pose = np.array([[0.0, -1, 0, 5], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
     path = Trajectory.from_transforms(times, np.stack([pose, pose]))

@@ -48,11 +48,11 @@ def test_a_disk_smaller_than_a_pixel_still_covers_one():
     assert np.isfinite(splat((0.02, 0.02, 10), 1e-4)).sum() == 1
 
 
-def test_nothing_behind_the_camera_is_drawn():
+def test_disks_behind_the_camera_are_not_drawn():
     assert not np.isfinite(splat((0, 0, -5), 1.0)).any()
 
 
-def test_the_nearest_two_objects_are_told_apart():
+def test_the_nearest_two_objects_are_distinguished():
     near, far = (np.full((40, 60), np.inf, np.float32) for _ in range(2))
     far[10:30, 10:40] = 20
     near[10:30, 25:50] = 8
@@ -62,7 +62,7 @@ def test_the_nearest_two_objects_are_told_apart():
     assert (instance[20, 45], first[20, 45], second[20, 45]) == (2, 8, np.inf)
 
 
-def test_objects_reach_beyond_themselves_but_not_to_the_border_of_the_image():
+def test_objects_are_dilated_by_a_margin():
     depth = np.full((60, 80), np.inf, np.float32)
     depth[25:35, 30:50] = 10
     first, instance, _ = nearest_objects({3: depth}, 100.0, (60, 80))
@@ -76,7 +76,7 @@ def test_frames_are_spread_evenly_over_the_log(limit, expected):
     assert chosen_frames(painted_log(frames=9), limit) == expected
 
 
-def test_all_frames_are_used_where_there_are_few():
+def test_all_frames_are_used_below_the_limit():
     assert chosen_frames(painted_log(frames=9), 100) == list(range(9))
 
 
@@ -92,7 +92,7 @@ def test_robust_mean_ignores_a_passing_car():
 @pytest.mark.parametrize(
     ("instance", "slant", "sampled"), [(1, 0.1, False), (1, 0.3, True), (0, 0.1, True)]
 )
-def test_objects_give_no_colour_to_views_along_their_surface(instance, slant, sampled):
+def test_grazing_views_do_not_colour_objects(instance, slant, sampled):
     normal = np.array([[math.sqrt(1 - slant**2), 0, -slant]], np.float32)
     point, depth = np.array([[0, 0, 10]], np.float32), np.full((40, 40), 10, np.float32)
     nothing = np.full((40, 40), np.inf, np.float32)

@@ -19,7 +19,7 @@ def wall(top: float, *, x: float = 10.0):
     return fit_surfels(points.astype(np.float32), largest=0.1)
 
 
-def test_a_wall_that_reaches_the_scan_limit_goes_on_above_it():
+def test_a_wall_at_the_scan_limit_continues_above_it():
     walls = continue_walls(wall(2.6), LIMIT, max_count=100_000)
     np.testing.assert_allclose(walls.points[:, 0], 10, atol=0.02)
     assert np.abs(walls.points[:, 1]).max() < 4.1
@@ -28,24 +28,24 @@ def test_a_wall_that_reaches_the_scan_limit_goes_on_above_it():
     assert np.abs(walls.normals[:, 0]).min() > 0.95
 
 
-def test_a_hedge_below_the_scan_limit_stays_a_hedge():
+def test_a_hedge_below_the_scan_limit_is_not_continued():
     assert len(continue_walls(wall(1.4), LIMIT, max_count=100_000)) == 0
 
 
-def test_a_distant_wall_is_left_alone():
+def test_a_distant_wall_is_not_continued():
     assert len(continue_walls(wall(8.0, x=60.0), LIMIT, max_count=100_000)) == 0
 
 
-def test_the_limit_on_their_number_is_kept():
+def test_the_number_of_wall_points_is_limited():
     assert 0 < len(continue_walls(wall(2.6), LIMIT, max_count=300)) <= 300
 
 
-def test_nothing_standing_gives_no_walls():
+def test_no_surfels_give_no_walls():
     empty = fit_surfels(np.zeros((0, 3), np.float32), largest=0.1)
     assert len(continue_walls(empty, LIMIT, max_count=100)) == 0
 
 
-def test_sky_unseen_and_inconsistent_candidates_are_no_walls():
+def test_sky_unseen_and_inconsistent_candidates_are_rejected():
     brick, blue, white = (0.5, 0.35, 0.3), (0.45, 0.6, 0.8), (1.0, 1.0, 1.0)
     colours = np.array([brick, brick, brick, blue, white], np.float32)
     known = np.array([True, False, True, True, True])

@@ -1,4 +1,4 @@
-"""The cost of rays, and its slopes by finite differences."""
+"""The ray loss and its gradients."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ MEMBERS = np.array([0, 1, 2], np.int32)
 MEASURED = np.array([10.0])
 DIRECTIONS = np.array([[[0.8, 0.0, 0.6]]], np.float32)
 SCALES = np.tile(np.array([[0.5, 0.5, 1e-4]], np.float32), (3, 1))
-"""Discs across z, so flat that the shift along the normal moves the sample by shift / 0.6."""
+"""Flat discs across z. A shift along the normal moves the sample by shift / 0.6."""
 LOGITS = np.array([-0.5, 0.7, 1.0])
 EXPONENTS = np.array([0.4, 1.1, 0.2])
 PLACES = np.array([9.2, 9.9, 10.1])
@@ -37,7 +37,7 @@ def cost_of(
 
 @pytest.mark.parametrize("column", [LOGIT, SIZE, SHIFT])
 @pytest.mark.parametrize("member", [0, 1, 2])
-def test_slopes_are_those_of_the_cost(column: int, member: int) -> None:
+def test_gradients_match_finite_differences(column: int, member: int) -> None:
     step = np.zeros((3, 3))
     step[column, member] = 1e-4
     given = np.stack([LOGITS, np.zeros(3), np.zeros(3)])
@@ -46,8 +46,8 @@ def test_slopes_are_those_of_the_cost(column: int, member: int) -> None:
     assert slope == pytest.approx((ahead - behind) / 2e-4, abs=2e-4)
 
 
-def test_light_that_stops_where_it_was_measured_costs_least() -> None:
-    # What stands far before the return should go, what is near it should stay.
+def test_the_loss_favours_stopping_at_the_measured_range() -> None:
+    # Gaussians far in front of the return should fade; those near it should stay.
     slopes = cost_of(LOGITS, np.zeros(3), np.zeros(3))[1][:, LOGIT]
     assert slopes[0] > 0
     assert slopes[1] < 0

@@ -1,4 +1,4 @@
-"""Recorded sweeps as rays, beam tables from them, and the surfaces that they make."""
+"""Recorded sweeps as rays, fitted beam tables and LiDAR surfaces."""
 
 from __future__ import annotations
 
@@ -46,13 +46,13 @@ def log() -> SyntheticLog:
     return generate_log(CONFIG)
 
 
-def test_rays_start_where_the_sensor_was(log: SyntheticLog) -> None:
+def test_recorded_rays_match_the_ray_cast_ground_truth(log: SyntheticLog) -> None:
     rays = recorded_rays(log, 2)
     assert rays is not None
     lidar = synthetic_lidar(CONFIG)
     truth, reflectivity = log.sweep(lidar, int(log.frame_times_us[2]))
     beams = rays.lidar.beams
-    # Rays lie on the grid on which they were cast: compare with the truth there.
+    # The rays lie on the casting grid, so compare at its nodes.
     row = np.abs(beams.elevation[:, None] - lidar.beams.elevation[:, 0]).argmin(1)
     turned = np.abs(wrapped(beams.azimuth[:, None] - lidar.beams.azimuth[0]))
     column = turned.argmin(1)
@@ -65,7 +65,7 @@ def test_rays_start_where_the_sensor_was(log: SyntheticLog) -> None:
 
 
 def ring_scan(elevations: np.ndarray, jitter: float) -> RecordedRays:  # type: ignore[type-arg]
-    """A scan that lists ring after ring from ahead on, anticlockwise, with gaps."""
+    """A scan in ring order, anticlockwise from straight ahead, with gaps."""
     rng = np.random.default_rng(0)
     azimuth, elevation, time = [], [], []
     for height in elevations:
@@ -93,24 +93,24 @@ def test_rings_are_found_from_a_raw_scan() -> None:
     assert rings.clockwise
     grid = rings.beams(rays)
     assert grid.shape == (32, rings.columns)
-    # Columns are at the instants at which the scan was there.
+    # Column times match the scan.
     expected = -grid.azimuth[0] / (2 * np.pi) * 1e5
     assert np.abs(grid.time_us[0] - expected)[np.abs(grid.azimuth[0]) < 3].max() < 200
 
 
-def test_what_a_ring_fired_and_did_not_get_back_is_found() -> None:
+def test_missing_returns_are_recovered() -> None:
     rays = ring_scan(np.radians(np.linspace(2, -24, 32)), np.radians(0.02))
     rings = fit_rings(rays)
     assert rings is not None
     missing = rings.missing(rays)
-    # Each of 32 rings fired 1,000 times and got 900 back.
+    # Each of 32 rings fired 1,000 times and received 900 returns.
     assert sum(lidar.beams.count for lidar in missing) == 3200
     fired = np.concatenate([rings.azimuth, *(lidar.beams.azimuth for lidar in missing)])
     steps = fired / (2 * np.pi / 1000)
     assert np.abs(steps - np.rint(steps)).max() < 0.05
 
 
-def test_surfaces_that_may_have_seen_held_out_frames_are_refused(log: SyntheticLog) -> None:
+def test_surfaces_of_unknown_training_frames_are_refused(log: SyntheticLog) -> None:
     scene = Scene(
         name="made", background=EMPTY, objects={}, sky=None, rig=log.rig, ego=log.ego,
         frame_times_us=log.frame_times_us,
@@ -120,14 +120,14 @@ def test_surfaces_that_may_have_seen_held_out_frames_are_refused(log: SyntheticL
         fit_lidar_surfaces(scene, log, surfaces=replace(scene, provenance={}))
 
 
-def test_a_scan_that_is_not_by_rings_gives_none() -> None:
+def test_a_scan_without_rings_is_not_fitted() -> None:
     rays = ring_scan(np.radians(np.linspace(2, -24, 32)), np.radians(2.0))
     assert fit_rings(rays) is None
 
 
 @dataclass(frozen=True, eq=False)
 class Withholding:
-    """A source that keeps the sweep of a frame to itself."""
+    """A source that fails on access to a held-out frame."""
 
     source: FrameSource
     held_out: int
@@ -142,7 +142,7 @@ class Withholding:
 
 
 @pytest.mark.slow
-def test_surfaces_learned_from_sweeps_measure_what_was_there(log: SyntheticLog) -> None:
+def test_learned_surfaces_improve_held_out_sweeps(log: SyntheticLog) -> None:
     options = InitialiseOptions(max_background=20_000, voxel=0.2, ground_spacing=0.2)
     scene = initialise_scene(log, options=options)
     scene = replace(scene, provenance={"reconstruction": {"held_out_frames": [2]}})

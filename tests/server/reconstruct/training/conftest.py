@@ -1,4 +1,4 @@
-"""One small training problem, made once."""
+"""A small training problem, shared by the session."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ TINY = TrainOptions(
     log_every=10,
     checkpoint_every=20,
     preview_every=0,
-    # Whole bodies of vehicles take longer to draw than all the rest.
+    # Complete vehicle bodies would dominate the rendering time.
     directions=DirectionOptions(close=False),
     initialise=InitialiseOptions(
         max_background=6_000,

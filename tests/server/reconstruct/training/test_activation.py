@@ -18,7 +18,7 @@ def parameters(dtype: torch.dtype) -> list[torch.Tensor]:
 
 
 def loss(drawn: Activated) -> torch.Tensor:
-    """Depends on every element in its own way, but for owners that no camera shows."""
+    """Weight every element differently, except those of owner 2, which no camera shows."""
     total = torch.zeros((), dtype=torch.float64)
     for parts in drawn:
         for index, part in enumerate(parts):
@@ -29,7 +29,7 @@ def loss(drawn: Activated) -> torch.Tensor:
 
 
 @pytest.mark.parametrize(("functions", "tones"), [(9, True), (4, True), (1, False)])
-def test_the_compiled_pass_agrees_with_plain_torch_in_float64_there_and_back(functions, tones):
+def test_compiled_values_and_gradients_match_plain_torch_in_float64(functions, tones):
     rng = torch.Generator().manual_seed(5)
     weights = torch.randn(len(COUNTS) - 1, HARMONICS if tones else 0, generator=rng)
     ours, truth = parameters(torch.float32), parameters(torch.float64)
@@ -46,7 +46,7 @@ def test_the_compiled_pass_agrees_with_plain_torch_in_float64_there_and_back(fun
         torch.testing.assert_close(mine.grad.double(), expected, rtol=1e-5, atol=1e-5)
 
 
-def test_a_scene_without_objects_is_drawn_too():
+def test_a_scene_without_objects_is_activated():
     log_scales, logits, sh, _ = (part[:10].detach() for part in parameters(torch.float32))
     drawn = activated(
         log_scales,

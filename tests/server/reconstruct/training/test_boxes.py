@@ -33,26 +33,26 @@ def long_log():
     return generate_log(SyntheticConfig(seed=2, frames=50, parked_cars=0))
 
 
-def test_exact_boxes_stay_as_they_are(long_log):
+def test_exact_boxes_are_unchanged(long_log):
     smooth = smoothed_boxes(long_log)
     assert max(errors(smooth, long_log)) == 0
 
 
-def test_scattered_boxes_come_closer_to_the_truth(long_log):
+def test_smoothing_reduces_box_noise(long_log):
     noisy = with_box_noise(long_log, 0.05, seed=1)
     given, smooth = errors(noisy, long_log), errors(smoothed_boxes(noisy), long_log)
     assert min(given) > 0.1
     assert max(s / g for s, g in zip(smooth, given, strict=True)) < 0.5
 
 
-def test_noise_is_repeatable_and_other_for_other_seeds(long_log):
+def test_box_noise_depends_only_on_the_seed(long_log):
     first, again = (with_box_noise(long_log, 0.05, seed=1) for _ in range(2))
     other = with_box_noise(long_log, 0.05, seed=2)
     assert max(errors(first, again)) == 0
     assert min(errors(first, other)) > 0.05
 
 
-def test_training_moves_a_box_back_to_where_the_image_shows_it(tiny_log, tiny_scene):
+def test_training_corrects_a_shifted_box(tiny_log, tiny_scene):
     name = max(tiny_scene.objects, key=lambda k: _nearness(tiny_log, tiny_scene.objects[k]))
     shifted = _shifted(tiny_scene, name, 0.25)
     options = replace(
@@ -86,7 +86,7 @@ def test_training_moves_a_box_back_to_where_the_image_shows_it(tiny_log, tiny_sc
 
 
 def _nearness(log, item: SceneObject) -> float:
-    """How large the object shows ahead of the recording vehicle."""
+    """Inverse distance of an object ahead of the ego [1/m], 0 if it is not ahead."""
     t_us = int(log.frame_times_us[3])
     if not item.trajectory.covers(t_us):
         return 0.0

@@ -31,7 +31,7 @@ CHECKPOINT = Checkpoint(
 
 def check_same(read: Checkpoint, given: Checkpoint) -> None:
     no_tensors: dict[str, torch.Tensor] = {}
-    # JSON has no tuples: options are compared as what they stand for.
+    # JSON has no tuples, so compare the parsed options.
     assert from_values(TrainOptions, read.options) == from_values(TrainOptions, given.options)
     same = {"tensors": no_tensors, "options": {}}
     assert vars(replace(read, **same)) == vars(replace(given, **same))
@@ -39,12 +39,12 @@ def check_same(read: Checkpoint, given: Checkpoint) -> None:
     assert all(torch.equal(read.tensors[k], given.tensors[k]) for k in given.tensors)
 
 
-def test_what_was_written_is_read(tmp_path):
+def test_a_checkpoint_round_trips(tmp_path):
     write_checkpoint(CHECKPOINT, tmp_path / "checkpoint")
     check_same(read_checkpoint(tmp_path / "checkpoint"), CHECKPOINT)
 
 
-def test_version_3_is_read_under_the_names_of_today(tmp_path):
+def test_version_3_is_read_with_current_names(tmp_path):
     folder = tmp_path / "checkpoint"
     write_checkpoint(CHECKPOINT, folder)
     text = json.dumps(json.loads((folder / STATE_FILE).read_text()) | {"version": 3})
@@ -64,7 +64,7 @@ def test_version_3_is_read_under_the_names_of_today(tmp_path):
     check_same(read_checkpoint(folder), CHECKPOINT)
 
 
-def test_boxes_of_a_run_of_before_are_upright(tmp_path):
+def test_older_checkpoints_have_no_box_tilt(tmp_path):
     yaws = {f"{group}.pose_yaw": torch.ones(4, 1) for group in ("model", "adam.first")}
     write_checkpoint(replace(CHECKPOINT, tensors=yaws), tmp_path / "checkpoint")
     read = read_checkpoint(tmp_path / "checkpoint").tensors

@@ -33,7 +33,7 @@ def body() -> VehicleBody:
 
 @pytest.fixture
 def ahead(tiny_scene):
-    """A scene's camera, time and pose of a car that drives 12 m ahead."""
+    """Camera, time and the pose of a car 12 m ahead."""
     pose = tiny_scene.ego.transform(tiny_scene.start_us)
     pose = pose @ np.array([[1, 0, 0, 12.0], [0, 1, 0, 0], [0, 0, 1, 0.75], [0, 0, 0, 1]])
     return tiny_scene.rig.cameras[0], tiny_scene.start_us, pose
@@ -63,7 +63,7 @@ def pixels(camera, scene, t_us, pose, means) -> np.ndarray:
 
 
 def deep_tail(body, camera, scene, t_us, pose) -> torch.Tensor:
-    """What a tail may look like after training: right in the image, up to a metre off in depth."""
+    """Tail points as after training: correct in the image, but up to 1 m off in depth."""
     tail = body.points[(body.points[:, 0] < -2.2) & (body.normals[:, 0] < -0.7)][::8]
     eye = (invert_transform(pose) @ camera.pose(scene.ego.transform(t_us)))[:3, 3]
     away = (tail - eye) / np.linalg.norm(tail - eye, axis=1, keepdims=True)
@@ -71,7 +71,7 @@ def deep_tail(body, camera, scene, t_us, pose) -> torch.Tensor:
     return torch.from_numpy(tail + off * away).float()
 
 
-def test_a_tail_learnt_deep_becomes_a_surface_where_images_have_it(tiny_scene, ahead, body):
+def test_a_tail_spread_in_depth_is_flattened_along_its_rays(tiny_scene, ahead, body):
     camera, t_us, pose = ahead
     means = deep_tail(body, camera, tiny_scene, t_us, pose)
     model = model_of(tiny_scene, pose, means)
@@ -86,7 +86,7 @@ def test_a_tail_learnt_deep_becomes_a_surface_where_images_have_it(tiny_scene, a
     assert float(thickness.max()) < 0.01
 
 
-def test_what_is_seen_from_many_sides_stays(tiny_scene, ahead, body):
+def test_vehicles_seen_from_several_sides_are_unchanged(tiny_scene, ahead, body):
     camera, t_us, pose = ahead
     means = deep_tail(body, camera, tiny_scene, t_us, pose)
     near = replace(camera, T_vehicle_camera=camera.T_vehicle_camera.copy())
@@ -97,7 +97,7 @@ def test_what_is_seen_from_many_sides_stays(tiny_scene, ahead, body):
     assert torch.equal(model.gaussians.means.detach()[model.gaussians.counts[0] :], means)
 
 
-def test_a_vehicle_without_a_body_is_offered_what_stage_0_has(tiny_scene, ahead, body):
+def test_a_vehicle_without_a_body_is_offered_its_initial_cloud(tiny_scene, ahead, body):
     camera, t_us, pose = ahead
     model = model_of(tiny_scene, pose, deep_tail(body, camera, tiny_scene, t_us, pose))
     offered = offer_bodies(model, [False], [None])
@@ -105,7 +105,7 @@ def test_a_vehicle_without_a_body_is_offered_what_stage_0_has(tiny_scene, ahead,
     assert (offered.alternatives < 0).all()
 
 
-def test_the_whole_body_is_offered_in_one_paint_and_once_for_each_inset(tiny_scene, ahead, body):
+def test_a_followed_vehicle_is_offered_a_painted_body_at_every_inset(tiny_scene, ahead, body):
     camera, t_us, pose = ahead
     means = deep_tail(body, camera, tiny_scene, t_us, pose)
     model = model_of(tiny_scene, pose, means)

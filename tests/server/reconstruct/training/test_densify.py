@@ -44,7 +44,7 @@ def some_gaussians() -> Gaussians:
 
 
 def marked(gaussians: Gaussians) -> SelectiveAdam:
-    """Moments that hold the values they belong to."""
+    """An optimizer whose moments equal the parameters, to trace rows."""
     optimizer = SelectiveAdam(gaussians.tensors())
     for name, tensor in gaussians.tensors().items():
         optimizer.first[name] = tensor.detach().clone()
@@ -60,7 +60,7 @@ def strategy_of(options: DensifyOptions = OPTIONS) -> Strategy:
 def round_of(
     options: DensifyOptions, gaussians: Gaussians, optimizer: SelectiveAdam, sums: ScreenSums
 ) -> Gaussians:
-    """The Gaussians after a step in which a round is due and nothing was drawn."""
+    """The Gaussians after a step with a densification round and no image."""
     strategy = strategy_of(options)
     strategy.state = sums
     return strategy.step_post_backward(gaussians, optimizer, step_without_image(0.0))
@@ -78,7 +78,7 @@ def sums_for(gaussians: Gaussians, growing: list[int]) -> ScreenSums:
 
 
 def check_alignment(gaussians: Gaussians, optimizer: SelectiveAdam) -> None:
-    """Moments are those of the same row, or zero for rows that are new."""
+    """Assert that moments follow their rows and are zero for new rows."""
     for name in FIELDS:
         values, moments = getattr(gaussians, name).detach(), optimizer.first[name]
         assert values.shape == moments.shape
@@ -86,7 +86,7 @@ def check_alignment(gaussians: Gaussians, optimizer: SelectiveAdam) -> None:
         assert torch.equal(values[old], moments[old])
 
 
-def test_small_ones_are_cloned_and_moments_stay_with_their_rows():
+def test_small_gaussians_are_cloned_and_moments_follow_their_rows():
     gaussians = some_gaussians()
     optimizer = marked(gaussians)
     grown = round_of(OPTIONS, gaussians, optimizer, sums_for(gaussians, [2, 33, 45]))
@@ -99,7 +99,7 @@ def test_small_ones_are_cloned_and_moments_stay_with_their_rows():
     assert int((~of_objects).sum()) == 2
 
 
-def test_large_ones_are_split_in_two_smaller_ones():
+def test_large_gaussians_are_split_in_two():
     gaussians = some_gaussians()
     with torch.no_grad():
         gaussians.log_scales[5] = 0.0
@@ -112,7 +112,7 @@ def test_large_ones_are_split_in_two_smaller_ones():
     assert not torch.equal(grown.means[new[0]], grown.means[new[1]])
 
 
-def test_transparent_ones_and_those_outside_their_box_go():
+def test_transparent_gaussians_and_those_outside_their_box_are_pruned():
     gaussians = some_gaussians()
     with torch.no_grad():
         gaussians.logits[3] = -20
@@ -122,7 +122,7 @@ def test_transparent_ones_and_those_outside_their_box_go():
     assert grown.counts == (29, 9, 8)
 
 
-def test_the_budget_holds_and_the_strongest_grow():
+def test_the_budget_goes_to_the_largest_gradients():
     gaussians = some_gaussians()
     sums = sums_for(gaussians, [1, 2, 3])
     sums.gradients[2] = 5.0
@@ -132,7 +132,7 @@ def test_the_budget_holds_and_the_strongest_grow():
     assert int((grown.means == gaussians.means[2]).all(1).sum()) == 2
 
 
-def test_mcmc_moves_dead_ones_to_live_ones_and_keeps_the_number():
+def test_mcmc_relocates_dead_gaussians():
     gaussians = some_gaussians()
     with torch.no_grad():
         gaussians.logits[:6] = -20
@@ -145,7 +145,7 @@ def test_mcmc_moves_dead_ones_to_live_ones_and_keeps_the_number():
     assert optimizer.first["fourier"].shape == moved.fourier.shape
 
 
-def test_two_copies_look_like_the_one_they_replace():
+def test_relocation_preserves_opacity_and_scale():
     opacity, factor = compute_relocation(torch.tensor([0.6]), torch.tensor([2]), 0.005)
     assert float(1 - (1 - opacity) ** 2) == pytest.approx(0.6, rel=1e-5)
     # eq. 9 written out for N = 2: o / (2 a - a^2 / sqrt(2)).
@@ -153,7 +153,7 @@ def test_two_copies_look_like_the_one_they_replace():
     assert float(factor) == pytest.approx(0.6 / (2 * a - a * a / 2**0.5), rel=1e-5)
 
 
-def test_mcmc_noise_leaves_solid_ones_and_spreads_along_the_shape():
+def test_mcmc_noise_moves_only_transparent_gaussians_along_their_shape():
     gaussians = some_gaussians()
     with torch.no_grad():
         gaussians.logits[0] = -6
@@ -170,7 +170,7 @@ def test_mcmc_noise_leaves_solid_ones_and_spreads_along_the_shape():
     assert abs(float(direction @ axis)) == pytest.approx(1, abs=1e-4)
 
 
-def test_the_same_seed_and_iteration_split_the_same_way():
+def test_splitting_is_reproducible():
     def once() -> torch.Tensor:
         gaussians = some_gaussians()
         with torch.no_grad():
@@ -180,7 +180,7 @@ def test_the_same_seed_and_iteration_split_the_same_way():
     assert torch.equal(once(), once())
 
 
-def test_opacities_are_reset_by_the_gradient_strategy_alone():
+def test_only_the_gradient_strategy_resets_opacities():
     options = replace(OPTIONS, reset_every=8)
     for method in ("gradient", "mcmc", "none"):
         gaussians = some_gaussians()
@@ -189,7 +189,7 @@ def test_opacities_are_reset_by_the_gradient_strategy_alone():
         assert lowered == (method == "gradient")
 
 
-def test_without_a_method_the_set_stays_as_it_is():
+def test_method_none_changes_nothing():
     gaussians = some_gaussians()
     options = replace(OPTIONS, method="none")
     sums = sums_for(gaussians, [1, 2])

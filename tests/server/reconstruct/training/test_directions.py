@@ -25,12 +25,12 @@ AHEAD = torch.tensor([1.0, 0, 0])
 
 
 def model_of(sh) -> SimpleNamespace:
-    """One Gaussian of an object."""
+    """A model with one Gaussian of an object."""
     return SimpleNamespace(gaussians=SimpleNamespace(sh=sh.clone(), counts=(0, 1)))
 
 
 def seen_from(directions: torch.Tensor) -> ViewingDirections:
-    """One Gaussian, seen along directions [V, 3]."""
+    """Viewing statistics of one Gaussian seen along directions [V, 3]."""
     unit = torch.nn.functional.normalize(directions, dim=-1)
     products = (unit[:, :, None] * unit[:, None]).mean(0)
     count = torch.tensor([float(len(unit))])
@@ -41,7 +41,7 @@ def colour(model, direction) -> torch.Tensor:
     return evaluate_sh(model.gaussians.sh, direction[None]) + 0.5
 
 
-def test_a_colour_seen_from_one_direction_is_the_same_from_all():
+def test_a_colour_seen_from_one_direction_becomes_view_independent():
     sh = torch.randn(1, 4, 3, generator=torch.Generator().manual_seed(1))
     model = model_of(sh)
     shown = colour(model, AHEAD)
@@ -50,7 +50,7 @@ def test_a_colour_seen_from_one_direction_is_the_same_from_all():
     np.testing.assert_allclose(colour(model, torch.tensor([0.0, 1, 0])), shown, atol=1e-5)
 
 
-def test_a_colour_seen_from_all_sides_stays():
+def test_a_colour_seen_from_all_sides_is_kept():
     sh = torch.randn(1, 4, 3, generator=torch.Generator().manual_seed(1))
     around = torch.randn(500, 3, generator=torch.Generator().manual_seed(2))
     model = model_of(sh)
@@ -64,7 +64,7 @@ def model(tiny_scene) -> SceneModel:
     return SceneModel(tiny_scene, replace(TINY, refine_poses=False), times, backend="cpu")
 
 
-def test_directions_lead_from_the_camera_to_what_it_sees(model, tiny_scene):
+def test_viewing_directions_point_from_the_camera_to_visible_gaussians(model, tiny_scene):
     camera, t_us = tiny_scene.rig.cameras[0], tiny_scene.start_us
     seen = viewing_directions(model, [(camera, t_us)])
     background = slice(0, model.gaussians.counts[0])
@@ -85,7 +85,7 @@ RED = torch.tensor([0.8, 0.1, 0.1])
 
 @pytest.fixture
 def followed(tiny_scene):
-    """A red car that was followed, as it was before training, the views of it, and its body."""
+    """The untrained model of a red car seen from behind, its views and its body."""
     body = fitted_body(np.zeros((0, 3), np.float32), SALOON, "car")
     times = np.array([tiny_scene.start_us, tiny_scene.end_us])
     pose = tiny_scene.ego.transform(tiny_scene.start_us) @ np.array(
@@ -106,14 +106,14 @@ def followed(tiny_scene):
     return model, [(camera, scene.start_us) for camera in scene.rig], body
 
 
-def test_of_a_car_seen_from_behind_the_flanks_are_unseen(followed):
+def test_the_flanks_of_a_car_seen_from_behind_are_unseen(followed):
     model, viewpoints, body = followed
     unseen = unseen_sides(model, viewpoints, [body])[-4:]
     assert unseen.tolist() == [False, True, True, True]
     assert not unseen_sides(model, viewpoints, [None]).any()
 
 
-def test_unseen_flanks_keep_what_is_seen_of_them_and_show_paint_from_ahead(followed):
+def test_unseen_flanks_keep_their_seen_colour_and_get_paint_from_ahead(followed):
     model, viewpoints, body = followed
     with torch.no_grad():
         model.gaussians.sh[-4:] = torch.randn(4, 4, 3, generator=torch.Generator().manual_seed(3))

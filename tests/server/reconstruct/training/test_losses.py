@@ -15,24 +15,24 @@ def pictures() -> tuple[torch.Tensor, torch.Tensor]:
     return (truth + 0.2 * torch.randn(23, 31, 3, generator=random)), truth
 
 
-def test_window_sums_to_one_and_is_symmetric():
+def test_the_window_sums_to_one_and_is_symmetric():
     window = gaussian_window()
     assert window.sum() == pytest.approx(1, abs=1e-6)
     np.testing.assert_array_equal(window, window[::-1])
 
 
-def test_ssim_equals_the_plain_version(pictures):
+def test_ssim_matches_the_plain_version(pictures):
     image, truth = pictures
     assert losses.ssim(image, truth) == pytest.approx(
         float(losses.ssim_plain(image, truth)), abs=1e-5
     )
 
 
-def test_ssim_of_equal_pictures_is_one(pictures):
+def test_ssim_of_equal_images_is_one(pictures):
     assert losses.ssim(pictures[1], pictures[1]) == pytest.approx(1, abs=1e-6)
 
 
-def test_a_wall_before_the_sky_has_a_gradient_as_dense_as_it_can_be_drawn():
+def test_sky_opacity_loss_has_gradients_up_to_full_opacity():
     alpha = torch.tensor([[0.0, 0.5], [1 - 1e-4, 0.9]], requires_grad=True)
     loss = losses.sky_opacity(alpha, torch.tensor([[1.0, 1.0], [1.0, 0.0]]))
     assert float(loss.detach()) == pytest.approx((np.log(2) + np.log(1e4)) / 4, rel=1e-3)
@@ -42,7 +42,7 @@ def test_a_wall_before_the_sky_has_a_gradient_as_dense_as_it_can_be_drawn():
 
 
 @pytest.mark.parametrize("fraction", [0.0, 0.2, 1.0])
-def test_photometric_loss_and_gradient_equal_torch(pictures, fraction):
+def test_photometric_loss_and_gradient_match_torch(pictures, fraction):
     image, truth = pictures
     ours, plain = image.clone().requires_grad_(), image.clone().double().requires_grad_()
     loss, l1, similarity, squared = losses.photometric(ours, truth, ssim_weight=fraction)
@@ -59,7 +59,7 @@ def test_photometric_loss_and_gradient_equal_torch(pictures, fraction):
     np.testing.assert_allclose(ours.grad, plain.grad, atol=2e-4 * scale)
 
 
-def test_lidar_depth_leaves_out_the_worst_points():
+def test_lidar_depth_ignores_the_worst_points():
     depth = torch.full((4, 25), 10.0, requires_grad=True)
     measured = torch.full((100,), 10.5)
     measured[:5] = 70.0
@@ -69,7 +69,7 @@ def test_lidar_depth_leaves_out_the_worst_points():
     assert not depth.grad.reshape(-1)[:5].any()
 
 
-def test_entropy_is_least_where_objects_are_solid_or_absent():
+def test_object_accumulation_is_lowest_for_solid_or_absent_objects():
     inside = torch.ones(2, 2, dtype=torch.bool)
     solid, half = torch.full((2, 2), 0.999), torch.full((2, 2), 0.5)
     assert losses.object_accumulation(solid, inside) < losses.object_accumulation(half, inside)
@@ -79,25 +79,25 @@ def test_entropy_is_least_where_objects_are_solid_or_absent():
     )
 
 
-def test_only_what_sticks_out_of_a_box_costs():
+def test_outside_box_loss_counts_only_the_excess():
     means = torch.tensor([[0.5, 0.0, 0.0], [1.5, -2.0, 0.0]])
     half = torch.ones(2, 3)
     assert float(losses.outside_box(means, half)) == pytest.approx((0.5 + 1.0) / 2)
 
 
-def test_discs_are_no_needles():
+def test_the_needle_loss_ignores_discs():
     disc, needle = torch.tensor([[1.0, 1.0, 0.01]]).log(), torch.tensor([[1.0, 0.02, 0.01]]).log()
     assert float(losses.needles(disc, 10)) == 0
     assert float(losses.needles(needle, 10)) == pytest.approx(40, rel=1e-4)
 
 
-def test_steady_motion_is_smooth_however_uneven_the_frames_are():
+def test_steady_motion_has_no_cost_with_uneven_frames():
     times = np.array([0.0, 0.1, 0.3, 0.4, 0.5, 0.7])
     steady = torch.from_numpy(times).float()[:, None] * torch.tensor([[8.0, -2.0, 0.5]])
     assert float(losses.second_differences(steady, times)) < 1e-10
 
 
-def test_one_pose_out_of_line_costs_its_second_differences():
+def test_an_outlier_pose_costs_its_second_differences():
     line = torch.zeros(8, 2)
     line[3, 0] = 0.1
     cost = losses.second_differences(line, np.arange(8) * 0.1)

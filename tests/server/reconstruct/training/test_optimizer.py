@@ -10,7 +10,7 @@ def gradients(step: int) -> torch.Tensor:
     return torch.randn(6, 3, generator=torch.Generator().manual_seed(step))
 
 
-def test_it_is_adam_where_everything_is_seen():
+def test_selective_adam_matches_adam_when_all_rows_are_seen():
     ours = torch.ones(6, 3, requires_grad=True)
     theirs = torch.ones(6, 3, requires_grad=True)
     optimizer, torch_adam = SelectiveAdam({"x": ours}), torch.optim.Adam([theirs], 0.01, eps=1e-15)
@@ -31,7 +31,7 @@ def test_unseen_rows_keep_value_and_moments():
     assert torch.equal(optimizer.first["x"].any(1), seen)
 
 
-def test_columns_may_learn_at_their_own_rates():
+def test_columns_can_have_separate_learning_rates():
     x = torch.zeros(6, 3, requires_grad=True)
     x.grad = torch.ones(6, 3)
     optimizer = SelectiveAdam({"x": x})

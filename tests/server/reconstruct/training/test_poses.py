@@ -1,4 +1,4 @@
-"""Corrections of boxes about all three axes, the same in training and in what is written."""
+"""Box corrections in six degrees of freedom, equal in training and in the export."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def poses(tiny_scene: Scene, tiny_log) -> ObjectPoses:
     return ObjectPoses(tiny_scene, tiny_log.frame_times_us)
 
 
-def test_a_written_trajectory_has_the_poses_that_were_trained(poses: ObjectPoses) -> None:
+def test_exported_trajectories_have_the_trained_poses(poses: ObjectPoses) -> None:
     random = torch.Generator().manual_seed(0)
     with torch.no_grad():
         poses.shifts.normal_(std=0.2, generator=random)
@@ -29,7 +29,7 @@ def test_a_written_trajectory_has_the_poses_that_were_trained(poses: ObjectPoses
             np.testing.assert_allclose(written.transform(t_us), pose, atol=1e-9)
 
 
-def test_boxes_without_corrections_are_those_given(poses: ObjectPoses, tiny_scene: Scene) -> None:
+def test_boxes_without_corrections_keep_their_poses(poses: ObjectPoses, tiny_scene: Scene) -> None:
     for index, item in enumerate(tiny_scene.objects.values()):
         t_us = item.trajectory.start_us
         np.testing.assert_allclose(
@@ -49,7 +49,7 @@ def test_roll_lifts_the_left_side_and_pitch_lowers_the_front(poses: ObjectPoses)
         assert raised[2] * sign == pytest.approx(np.sin(0.1), abs=1e-3)
 
 
-def test_every_correction_has_a_gradient_and_rough_ones_cost(poses: ObjectPoses) -> None:
+def test_every_correction_has_a_gradient(poses: ObjectPoses) -> None:
     with torch.no_grad():
         poses.tilts[::2] = 0.1
     present, trained = poses.at(int(poses.keys[0].times_us[1]))

@@ -47,7 +47,7 @@ def trained(tiny_log, tiny_scene):
 
 
 def mean_psnr(trainer: Trainer) -> float:
-    """Over the training images [dB]."""
+    """Mean PSNR over the training images [dB]."""
     errors = []
     for index in range(len(trainer.views)):
         view = trainer.views.view(index)
@@ -57,12 +57,12 @@ def mean_psnr(trainer: Trainer) -> float:
     return float(np.mean(errors))
 
 
-def test_training_images_become_better(trained):
+def test_training_improves_the_training_images(trained):
     trainer, before = trained
     assert mean_psnr(trainer) > before + 1
 
 
-def test_a_grey_scene_learns_its_colours_to_several_decibels(tiny_log, tiny_scene):
+def test_a_grey_scene_learns_its_colours(tiny_log, tiny_scene):
     grey = replace(tiny_scene.background, sh=torch.zeros_like(tiny_scene.background.sh))
     scene = replace(tiny_scene, background=grey)
     trainer = Trainer(tiny_log, scene, replace(TINY, densify=DensifyOptions(method="none")))
@@ -73,7 +73,7 @@ def test_a_grey_scene_learns_its_colours_to_several_decibels(tiny_log, tiny_scen
 
 @dataclass(frozen=True)
 class Exposed:
-    """Images of a log, and those of a camera beside "front" half a stop brighter, or of frames."""
+    """A log with a second camera, or some frames, half a stop brighter."""
 
     log: DrivingLog
     bright_frames: tuple[int, ...]
@@ -101,7 +101,7 @@ def exposed(log: DrivingLog, scene: Scene, *, by_camera: bool) -> tuple[DrivingL
     "by_camera",
     [pytest.param(True, id="camera", marks=pytest.mark.slow), pytest.param(False, id="image")],
 )
-def test_images_of_half_a_stop_more_light_are_told_from_the_scene(tiny_log, tiny_scene, by_camera):
+def test_exposure_differences_are_learnt(tiny_log, tiny_scene, by_camera):
     log, scene = exposed(tiny_log, tiny_scene, by_camera=by_camera)
     learnt = {"exposure": 0.01} if by_camera else {"image_exposure": 0.02}
     rates = replace(TINY.learning_rates, **learnt)
@@ -117,12 +117,12 @@ def test_images_of_half_a_stop_more_light_are_told_from_the_scene(tiny_log, tiny
     with torch.no_grad():
         more = model.exposed(grey, log.rig[bright], int(times[frame])).mean()
         less = model.exposed(grey, log.rig["front"], int(times[3])).mean()
-    # Half a stop is a factor of 1.17 of what is stored, about the middle.
+    # Half a stop is a factor of about 1.17 in display values at mid grey.
     assert 1.05 < float(more / less) < 1.3
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_every_loss_of_a_preset_has_what_it_needs(tiny_log, tiny_scene, name):
+def test_every_loss_of_a_preset_is_evaluated(tiny_log, tiny_scene, name):
     options = replace(TINY, iterations=100, losses=PRESETS[name].losses)
     options = replace(options, learning_rates=PRESETS[name].learning_rates)
     wanted = {k for k, weight in asdict(options.losses).items() if weight > 0} - {"needle_ratio"}
@@ -132,11 +132,11 @@ def test_every_loss_of_a_preset_has_what_it_needs(tiny_log, tiny_scene, name):
     trainer.iteration = 90
     terms = trainer.step()
     trainer.views.close()
-    # The similarity is a part of the picture's term.
+    # SSIM is part of the picture term.
     assert set(terms) == (wanted - {"ssim"}) | {"picture"}
 
 
-def test_views_know_their_sky_at_every_size_and_only_for_a_loss_that_asks(tiny_log):
+def test_views_have_a_sky_mask_only_for_the_sky_loss(tiny_log):
     views = TrainingViews(tiny_log, [0, 3], TINY)
     for index in range(2):
         sky, half = (views.view(index, divisor).sky for divisor in (1, 2))
@@ -147,7 +147,7 @@ def test_views_know_their_sky_at_every_size_and_only_for_a_loss_that_asks(tiny_l
     assert TrainingViews(tiny_log, [0], without).view(0).sky is None
 
 
-def test_held_out_views_are_scored_whole_and_over_moving_objects(trained, tiny_log):
+def test_held_out_views_are_scored_overall_and_on_objects(trained, tiny_log):
     trainer, _ = trained
     score = score_held_out(trainer.model, tiny_log, TINY)
     assert score.views == 1
@@ -156,7 +156,7 @@ def test_held_out_views_are_scored_whole_and_over_moving_objects(trained, tiny_l
     assert 0.3 < score.ssim < 1
 
 
-def test_the_exported_scene_looks_like_the_model(trained, tiny_log):
+def test_the_exported_scene_renders_like_the_model(trained, tiny_log):
     trainer, _ = trained
     scene = trainer.model.export(stage=1)
     camera, t_us = tiny_log.rig.cameras[0], int(tiny_log.frame_times_us[3])
@@ -172,7 +172,7 @@ def test_the_exported_scene_looks_like_the_model(trained, tiny_log):
     [({"harmonics": 0, "refine_poses": False}, 0.0), ({}, 1e-6)],
     ids=["to the last bit", "moving boxes and colours"],
 )
-def test_what_is_written_shows_what_was_trained_also_where_the_sky_wants_to_be_brighter_than_white(
+def test_the_saved_scene_renders_like_the_model_with_a_saturated_sky(
     tiny_log, tiny_scene, tmp_path, changes, rounding
 ):
     rates = replace(TINY.learning_rates, sky=(0.5, 0.5))
@@ -198,7 +198,7 @@ def test_what_is_written_shows_what_was_trained_also_where_the_sky_wants_to_be_b
     assert float((trained - written.rgb[0]).abs().max()) <= rounding
 
 
-def test_a_scene_that_was_exported_shares_nothing_with_the_model(trained):
+def test_an_exported_scene_shares_no_memory_with_the_model(trained):
     trainer, _ = trained
     scene = trainer.model.export()
     before = scene.background.means.clone()
@@ -209,9 +209,7 @@ def test_a_scene_that_was_exported_shares_nothing_with_the_model(trained):
     assert torch.equal(scene.background.means, before)
 
 
-def test_priors_are_drawn_from_their_round_on_stay_as_they_are_and_are_exported(
-    tiny_log, tiny_scene
-):
+def test_priors_are_added_at_their_round_stay_fixed_and_are_exported(tiny_log, tiny_scene):
     options = replace(TINY, iterations=20)
     trainer = Trainer(tiny_log, tiny_scene, options)
     trainer.run(until=16)
@@ -239,7 +237,7 @@ BROKEN_OFF = replace(TINY, iterations=40, mirror=0.5, directions=DirectionOption
 
 @pytest.fixture(scope="module")
 def whole(tiny_log, tiny_scene, tmp_path_factory):
-    """A run to its end, and its folder."""
+    """A complete run and its folder."""
     folder = tmp_path_factory.mktemp("whole")
     trainer = Trainer(tiny_log, tiny_scene, BROKEN_OFF, folder=folder)
     trainer.run()
@@ -249,9 +247,7 @@ def whole(tiny_log, tiny_scene, tmp_path_factory):
 @pytest.mark.parametrize(
     ("every", "until", "since"), [(20, 33, 20), (12, 38, 36)], ids=["early", "among priors"]
 )
-def test_a_run_that_was_broken_off_goes_on_bit_for_bit(
-    tiny_log, tiny_scene, whole, tmp_path, every, until, since
-):
+def test_a_resumed_run_is_bit_identical(tiny_log, tiny_scene, whole, tmp_path, every, until, since):
     expected, folder = whole
     options = replace(BROKEN_OFF, checkpoint_every=every)
     Trainer(tiny_log, tiny_scene, options, folder=tmp_path).run(until=until)
@@ -273,13 +269,13 @@ def test_resuming_with_other_options_is_refused(tiny_log, tiny_scene, tmp_path):
         other.resume()
 
 
-def test_nothing_to_resume_is_said(tiny_log, tiny_scene, tmp_path):
+def test_resuming_without_a_checkpoint_is_refused(tiny_log, tiny_scene, tmp_path):
     with pytest.raises(ReconstructError, match="no checkpoint"):
         Trainer(tiny_log, tiny_scene, TINY, folder=tmp_path).resume()
 
 
 @pytest.mark.parametrize("paint", [True, False])
-def test_unseen_sides_are_painted_once_after_the_last_step_if_asked(
+def test_unseen_sides_are_painted_once_after_the_last_step(
     tiny_log, tiny_scene, monkeypatch, paint
 ):
     painted = []
@@ -294,13 +290,13 @@ def test_unseen_sides_are_painted_once_after_the_last_step_if_asked(
     assert painted == ([len(tiny_scene.objects)] if paint else [])
 
 
-def test_held_out_frames_lie_between_seen_ones():
+def test_held_out_frames_lie_between_training_frames():
     assert held_out_frames(9, 4) == [2, 6]
     assert held_out_frames(7, 4) == [2]
     assert held_out_frames(9, 0) == []
 
 
-def test_sampled_viewpoints_lie_evenly_over_time_of_every_camera(tiny_log):
+def test_sampled_viewpoints_are_evenly_spaced_for_every_camera(tiny_log):
     front = tiny_log.rig.cameras[0]
     rig = replace(tiny_log.rig, cameras=(front, replace(front, name="left")))
     views = TrainingViews(replace(tiny_log, rig=rig), [0, 1, 3, 4, 5, 6], TINY)
@@ -311,7 +307,7 @@ def test_sampled_viewpoints_lie_evenly_over_time_of_every_camera(tiny_log):
         assert times == [int(tiny_log.frame_times_us[f]) for f in (1, 4, 6)]
 
 
-def test_a_mirrored_cloud_looks_from_one_side_as_the_cloud_from_the_other(trained):
+def test_a_mirrored_cloud_has_mirrored_colours_and_positions(trained):
     trainer, _ = trained
     gaussians = trainer.model.gaussians
     with torch.no_grad():

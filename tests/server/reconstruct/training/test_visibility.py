@@ -47,7 +47,7 @@ def viewpoints(tiny_scene) -> list[tuple[Camera, int]]:
 
 
 def ahead(model: SceneModel, depth: float, scale: float, opacity: float) -> GaussianCloud:
-    """One round Gaussian on the axis of the first camera when the drive begins."""
+    """An isotropic Gaussian on the axis of the first camera at the start."""
     scene = model.scene
     T = np.linalg.inv(scene.rig.cameras[0].viewmat(scene.ego.transform(scene.start_us)))
     mean = torch.from_numpy(T @ [0, 0, depth, 1])[:3].float()
@@ -63,7 +63,7 @@ def ahead(model: SceneModel, depth: float, scale: float, opacity: float) -> Gaus
 def model_of(
     model: SceneModel, clouds: list[GaussianCloud], *, subject: list[GaussianCloud] | None = None
 ) -> SceneModel:
-    """Of ``clouds`` and of an object whose frame is the world."""
+    """A model of ``clouds`` and of an object whose frame is the world frame."""
     objects = {}
     if subject is not None:
         times = np.array([model.scene.start_us, model.scene.end_us])
@@ -100,31 +100,31 @@ def fractions_of(model: SceneModel, viewpoints: list[tuple[Camera, int]]) -> tor
     return visibility(model, viewpoints).fractions
 
 
-def test_a_gaussian_alone_is_all_visible(model, viewpoints):
+def test_a_single_gaussian_is_fully_visible(model, viewpoints):
     [fraction] = fractions_of(model_of(model, [ahead(model, 5, 0.2, 0.7)]), viewpoints)
     assert fraction == pytest.approx(1, abs=0.02)
 
 
-def test_one_behind_an_opaque_wall_is_hidden_and_the_wall_is_not(model, viewpoints):
+def test_a_gaussian_behind_an_opaque_wall_is_hidden(model, viewpoints):
     wall = [ahead(model, 4 + 0.01 * k, 1.0, 0.99) for k in range(4)]
     fractions = fractions_of(model_of(model, [*wall, ahead(model, 8, 0.05, 0.7)]), viewpoints)
     assert fractions[0] > 0.8
     assert fractions[-1] < 1e-3
 
 
-def test_half_of_what_stands_behind_a_half_transparent_wall_is_visible(model, viewpoints):
+def test_a_gaussian_behind_a_half_transparent_wall_is_half_visible(model, viewpoints):
     fractions = fractions_of(
         model_of(model, [ahead(model, 4, 5.0, 0.5), ahead(model, 8, 0.1, 0.7)]), viewpoints
     )
     assert fractions[1] == pytest.approx(0.5, abs=0.03)
 
 
-def test_what_is_never_before_a_camera_has_no_visible_fraction(model, viewpoints):
+def test_a_gaussian_behind_all_cameras_is_not_visible(model, viewpoints):
     [fraction] = fractions_of(model_of(model, [ahead(model, -5, 0.2, 0.7)]), viewpoints)
     assert fraction == 0
 
 
-def test_sides_of_vehicles_that_training_shows_mirrored_count_as_seen(tiny_log, tiny_scene):
+def test_mirrored_vehicle_sides_count_as_seen(tiny_log, tiny_scene):
     viewpoints = Trainer(tiny_log, tiny_scene, TINY, backend="cpu").views.viewpoints()
     times = np.array([tiny_scene.start_us, tiny_scene.end_us])
 
@@ -137,7 +137,7 @@ def test_sides_of_vehicles_that_training_shows_mirrored_count_as_seen(tiny_log, 
     assert bool((mirrored & ~plain).any())
 
 
-def test_the_unhindered_weight_is_the_area_of_the_ellipse_on_the_image(model):
+def test_the_unoccluded_weight_is_opacity_times_image_area(model):
     camera = model.scene.rig.cameras[0]
     viewmat = torch.from_numpy(camera.viewmat(model.scene.ego.transform(model.scene.start_us)))
     [weight] = unoccluded_weights(Instance(ahead(model, 5, 0.2, 0.7)), viewmat, camera)
@@ -145,7 +145,7 @@ def test_the_unhindered_weight_is_the_area_of_the_ellipse_on_the_image(model):
     assert weight == pytest.approx(0.7 * 2 * math.pi * squared, rel=1e-3)
 
 
-def test_hidden_ones_go_by_the_limits_of_their_owners_with_their_moments():
+def test_hidden_gaussians_are_pruned_by_the_limits_of_their_owner():
     gaussians = some_gaussians()
     optimizer: SelectiveAdam = marked(gaussians)
     fractions = torch.full((len(gaussians),), 0.03)
@@ -157,7 +157,7 @@ def test_hidden_ones_go_by_the_limits_of_their_owners_with_their_moments():
     torch.testing.assert_close(left.means, gaussians.means[5 : COUNTS[0]])
 
 
-def test_what_little_is_seen_of_goes_only_deep_behind_the_surface():
+def test_barely_visible_gaussians_are_pruned_only_behind_the_surface():
     gaussians = some_gaussians()
     fractions, depths = torch.full((len(gaussians),), 0.02), torch.zeros(len(gaussians))
     depths[2], depths[3], fractions[3] = 0.5, 0.5, 0.5
@@ -167,7 +167,7 @@ def test_what_little_is_seen_of_goes_only_deep_behind_the_surface():
     torch.testing.assert_close(left.means, gaussians.means[kept])
 
 
-def test_inside_of_objects_goes_at_less_depth_and_more_share_than_in_the_background():
+def test_object_limits_prune_shallower_and_more_visible_gaussians():
     gaussians = some_gaussians()
     seen = GaussianVisibility(*(torch.full((len(gaussians),), value) for value in (0.2, 0.25, 0)))
     left = dropped(gaussians, marked(gaussians), seen, object_limits=LIMITS.last_object_limits)
@@ -182,7 +182,7 @@ def test_depth_behind_the_surface_is_measured_along_the_axis(model, viewpoints):
     assert float(seen.depths[0]) == pytest.approx(0, abs=0.1)
 
 
-def test_the_sky_is_hidden_behind_what_covers_it_and_where_no_camera_looks(model, viewpoints):
+def test_the_sky_is_hidden_where_covered_or_out_of_view(model, viewpoints):
     wall = [ahead(model, 4, 30.0, 0.99)]
     bare, walled = model_of(model, [ahead(model, -5, 0.1, 0.5)]), model_of(model, wall)
     open_to_view = ~hidden_sky(bare, viewpoints)
@@ -190,7 +190,7 @@ def test_the_sky_is_hidden_behind_what_covers_it_and_where_no_camera_looks(model
     assert int((~hidden_sky(walled, viewpoints)).sum()) < 0.8 * int(open_to_view.sum())
 
 
-def test_two_packs_are_joined_owner_by_owner():
+def test_gaussians_are_concatenated_by_owner():
     a, b = some_gaussians(), some_gaussians()
     both, of_b = concatenate(a, b)
     assert both.counts == tuple(2 * n for n in COUNTS)
@@ -198,7 +198,7 @@ def test_two_packs_are_joined_owner_by_owner():
     torch.testing.assert_close(both.select(of_b.nonzero()[:, 0]).means, b.means)
 
 
-def test_priors_come_back_where_nothing_shows_them_and_nowhere_else(model, viewpoints):
+def test_only_occluded_priors_are_restored(model, viewpoints):
     wall = [ahead(model, 4, 3.0, 0.99), ahead(model, 4.1, 3.0, 0.99)]
     behind, beside = ahead(model, 8, 0.2, 0.7), ahead(model, 3, 0.2, 0.7)
     trained, first = model_of(model, wall), model_of(model, [*wall, behind, beside])
@@ -207,20 +207,20 @@ def test_priors_come_back_where_nothing_shows_them_and_nowhere_else(model, viewp
     assert len(trained.gaussians) == len(wall)
 
 
-def test_priors_that_training_has_laid_open_stay_away(model, viewpoints):
+def test_priors_exposed_by_training_are_not_restored(model, viewpoints):
     wall = [ahead(model, 4, 3.0, 0.99)]
     trained = model_of(model, [ahead(model, 12, 0.2, 0.7)])
     first = model_of(model, [*wall, ahead(model, 8, 0.2, 0.7)])
     assert len(occluded_priors(trained, first, viewpoints, limit=0.05)) == 0
 
 
-def test_objects_get_back_what_they_hide_though_stage_0_showed_it(model, viewpoints):
+def test_occluded_object_priors_are_restored_even_if_initially_visible(model, viewpoints):
     shown, wall = ahead(model, 8, 0.2, 0.7), [ahead(model, 4, 3.0, 0.99)] * 3
     trained, first = model_of(model, wall, subject=wall), model_of(model, [shown], subject=[shown])
     assert occluded_priors(trained, first, viewpoints, limit=0.05).counts == (0, 1)
 
 
-def test_a_prior_on_a_side_that_no_image_shows_comes_back_though_visible(model, viewpoints):
+def test_wanted_priors_are_restored_even_if_visible(model, viewpoints):
     shown = [ahead(model, 8, 0.2, 0.7)]
     trained = model_of(model, [ahead(model, 12, 0.2, 0.7)], subject=[ahead(model, 20, 0.2, 0.7)])
     first = model_of(model, [ahead(model, 12, 0.2, 0.7)], subject=shown)
@@ -230,7 +230,7 @@ def test_a_prior_on_a_side_that_no_image_shows_comes_back_though_visible(model, 
     assert found.counts == (0, 1)
 
 
-def test_a_prior_stays_away_though_another_stands_before_it(model, viewpoints):
+def test_priors_occluded_only_by_other_priors_are_not_restored(model, viewpoints):
     wall = [ahead(model, 4, 3.0, 0.99)]
     trained = model_of(model, [ahead(model, 12, 0.2, 0.7)])
     pair = [ahead(model, 8, 0.2, 0.99), ahead(model, 8.5, 0.1, 0.99)]
@@ -238,7 +238,7 @@ def test_a_prior_stays_away_though_another_stands_before_it(model, viewpoints):
     assert len(occluded_priors(trained, first, viewpoints, limit=0.05)) == 0
 
 
-def test_training_drops_what_is_hidden_at_its_rounds(tiny_log, tiny_scene):
+def test_training_prunes_hidden_gaussians_at_its_rounds(tiny_log, tiny_scene):
     densify = replace(TINY.densify, method="none", hidden_rounds=(0.05,))
     trainer = Trainer(tiny_log, tiny_scene, replace(TINY, densify=densify), backend="cpu")
     before = len(trainer.model.gaussians)
@@ -250,7 +250,7 @@ def test_training_drops_what_is_hidden_at_its_rounds(tiny_log, tiny_scene):
     trainer.views.close()
 
 
-def test_of_alternatives_the_first_that_is_hidden_is_taken(model, viewpoints):
+def test_the_first_hidden_alternative_is_taken(model, viewpoints):
     wall = [ahead(model, 4 + 0.01 * k, 1.0, 0.99) for k in range(4)]
     trained = model_of(model, wall, subject=[ahead(model, 30, 0.02, 0.5)])
     offered = [ahead(model, depth, 0.1, 0.9) for depth in (3.0, 6.0, 7.0)]
@@ -264,7 +264,7 @@ def test_of_alternatives_the_first_that_is_hidden_is_taken(model, viewpoints):
 @pytest.mark.parametrize(
     ("scale", "bodies", "hardly"), [(0.02, True, True), (0.02, False, False), (1.0, True, False)]
 )
-def test_of_bodies_that_images_hardly_show_all_is_offered(model, viewpoints, scale, bodies, hardly):
+def test_hardly_visible_objects_with_a_body_are_found(model, viewpoints, scale, bodies, hardly):
     wall = [ahead(model, 40, 3.0, 0.99)]
     trained = model_of(model, wall, subject=[ahead(model, 10, scale, 0.9)])
     numbers = torch.tensor([-1, 7 if bodies else -1])
@@ -273,13 +273,13 @@ def test_of_bodies_that_images_hardly_show_all_is_offered(model, viewpoints, sca
     assert found.tolist() == [False, hardly]
 
 
-def test_after_priors_no_mirrored_image_counts(model):
+def test_stop_mirroring_disables_mirrored_objects(model):
     model.mirrored = (True, False)
     model.stop_mirroring()
     assert model.mirrored == (False, False)
 
 
-def test_low_background_that_shows_from_deep_behind_goes_and_high_background_stays(model):
+def test_only_low_background_deep_behind_the_surface_is_removed(model):
     count = len(model.gaussians)
     deep = GaussianVisibility(*(torch.full((count,), value) for value in (0.08, 9.0, 0)))
     found = behind_objects(model, deep, LIMITS.last_background_limits)
@@ -292,7 +292,7 @@ def test_low_background_that_shows_from_deep_behind_goes_and_high_background_sta
     assert not behind_objects(model, shallow, LIMITS.last_background_limits).any()
 
 
-def test_ground_is_bare_where_images_show_none(model, tiny_scene):
+def test_ground_is_bare_where_training_removed_it(model, tiny_scene):
     kept = model.gaussians.means[:, 0] > 0
     kept |= model.gaussians.owners > 0
     first = SceneModel(tiny_scene, model.options, np.zeros(0, np.int64), backend="cpu")

@@ -1,4 +1,4 @@
-"""Rays against shapes whose ranges are known, and against the plain twin."""
+"""Ray casting against closed-form ranges and the plain reference."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ ROWS = np.radians(np.linspace(-12, 10, 16))
 def discs(
     centres: Array, normals: Array, *, spacing: float, opacity: float = 0.95
 ) -> GaussianCloud:
-    """Flat Gaussians that together are an opaque surface."""
+    """Flat Gaussians that form an opaque surface."""
     half = np.cross([1.0, 0, 0], normals)
     w = 1 + normals[:, :1]
     backwards = w[:, 0] < 1e-6
@@ -42,7 +42,7 @@ def discs(
 
 
 def wall(normal: Sequence[float], offset: float, *, half: float, spacing: float) -> GaussianCloud:
-    """The upright plane ``normal . x = -offset``, facing the origin."""
+    """The vertical plane ``normal . x = -offset``, facing the origin."""
     n = np.array([*normal, 0.0])
     along = np.array([-n[1], n[0], 0.0])
     across, up = np.meshgrid(np.arange(-half, half, spacing), np.arange(-6, 6, spacing))
@@ -55,13 +55,13 @@ ROOM = (((-1.0, 0.0), 16.0), ((1.0, 0.0), 16.0), ((0.0, -1.0), 12.0), ((0.0, 1.0
 
 @pytest.fixture(scope="module")
 def room() -> GaussianCloud:
-    """Four walls about the origin."""
+    """Four walls around the origin."""
     walls = [wall(normal, offset, half=17.0, spacing=0.25) for normal, offset in ROOM]
     return GaussianCloud.concatenate(walls)
 
 
 def room_ranges(origins: Array, directions: Array) -> Array:
-    """Ray casting in that room; NaN in its corners, where samples of two walls lie mixed."""
+    """Exact ranges in the room; NaN in its corners, where the Gaussians of two walls overlap."""
     distances = []
     for normal, offset in ROOM:
         n = np.array([*normal, 0.0])
@@ -74,14 +74,14 @@ def room_ranges(origins: Array, directions: Array) -> Array:
 
 
 def driving(lidar: Lidar, *, speed: float, turn_deg: float) -> Array:
-    """Poses of a sensor that drives ahead and turns, [S, 4, 4]."""
+    """Poses [S, 4, 4] of a sensor that moves forward and turns."""
     seconds = lidar.beams.slots[0] * 1e-6
     positions = np.stack([speed * seconds, 0.1 * speed * seconds, 0 * seconds], axis=-1)
     return transform_from(positions, yaw_quaternion(np.radians(turn_deg) * seconds))
 
 
 def true_ranges(lidar: Lidar, poses: Array) -> Array:
-    """Ray casting with the sensor where it is at each ray's own instant."""
+    """Exact ranges with the sensor pose at the time of each ray."""
     pose = poses[lidar.beams.slots[1]]
     directions = np.einsum("...ij,...j->...i", pose[..., :3, :3], lidar.beams.directions)
     return room_ranges(pose[..., :3, 3], directions)
@@ -107,7 +107,7 @@ def test_a_plane_is_measured_within_a_millimetre(distance: float) -> None:
     assert np.abs(echo.range - truth)[inside].max() <= 1e-3
 
 
-def test_driving_and_turning_add_no_error(room: GaussianCloud) -> None:
+def test_ego_motion_adds_no_error(room: GaussianCloud) -> None:
     lidar = spinning()
     still = cast([Instance(room)], lidar, np.eye(4))
     poses = driving(lidar, speed=15.0, turn_deg=30.0)
@@ -117,12 +117,12 @@ def test_driving_and_turning_add_no_error(room: GaussianCloud) -> None:
     assert np.isfinite(on_the_way).mean() > 0.9
     assert np.nanmax(at_rest) <= 1e-3
     assert np.nanmax(on_the_way) <= 1e-3
-    # It bites: with the pose of the middle for all, ranges are off by decimetres.
+    # With one pose for all rays, ranges are off by more than 0.5 m.
     frozen = np.abs(moving.range - true_ranges(lidar, np.broadcast_to(np.eye(4), poses.shape)))
     assert np.nanmax(frozen) > 0.5
 
 
-def test_the_seam_is_as_good_as_everywhere_else(room: GaussianCloud) -> None:
+def test_the_azimuth_seam_adds_no_error(room: GaussianCloud) -> None:
     lidar = spinning()
     poses = driving(lidar, speed=15.0, turn_deg=30.0)
     echo = cast([Instance(room)], lidar, poses)
@@ -130,12 +130,12 @@ def test_the_seam_is_as_good_as_everywhere_else(room: GaussianCloud) -> None:
     seam = np.abs(np.abs(lidar.beams.azimuth) - np.pi) < np.radians(6)
     assert seam.sum() > 100
     assert np.nanmax(error[seam]) <= max(np.nanmax(error[~seam]), 1e-4)
-    # Nothing is met twice: the light stops as fast as elsewhere.
+    # No Gaussian is hit twice: opacity accumulates as elsewhere.
     assert echo.hit.all()
     assert np.median(echo.opacity[seam]) == pytest.approx(np.median(echo.opacity[~seam]), abs=0.01)
 
 
-def test_a_moving_object_is_met_where_it_is_at_the_rays_own_instant() -> None:
+def test_moving_objects_are_hit_at_the_time_of_each_ray() -> None:
     lidar = spinning()
     seconds = lidar.beams.slots[0] * 1e-6
     plane = wall((-1.0, 0.0), 0.0, half=4.0, spacing=0.2)
@@ -153,7 +153,7 @@ def test_a_moving_object_is_met_where_it_is_at_the_rays_own_instant() -> None:
     assert (echo.instance[inside] == 7).all()
 
 
-def test_two_panes_are_the_first_and_the_last_return() -> None:
+def test_two_panes_give_the_first_and_the_last_return() -> None:
     def pane(distance: float, opacity: float) -> GaussianCloud:
         centre = np.array([[distance, 0.0, 0]])
         return discs(centre, np.array([[-1.0, 0, 0]]), spacing=20.0, opacity=opacity)
@@ -167,12 +167,12 @@ def test_two_panes_are_the_first_and_the_last_return() -> None:
     assert np.allclose(first.range[ahead], 10 / slant, atol=1e-3)
     assert np.allclose(last.range[ahead], 20 / slant, atol=1e-3)
     assert np.allclose(first.power[ahead], 0.4, atol=0.02)
-    # Two ways through the first pane: 0.6 squared is left for the second.
+    # The light passes the first pane twice: 0.6^2 is left for the second.
     assert np.allclose(last.power[ahead], 0.36, atol=0.03)
 
 
 def scattered(seed: int = 3) -> tuple[list[Instance], list[NDArray[np.float32]]]:
-    """Gaussians of all kinds, an object, and one whose shape is a covariance."""
+    """Random Gaussians: a background, an object and an object with covariances."""
     rng = np.random.default_rng(seed)
 
     def cloud(n: int, reach: float) -> GaussianCloud:
@@ -219,7 +219,7 @@ def table() -> Beams:
     ],
     ids=["spinning", "offsets", "table"],
 )
-def test_the_kernel_gives_what_the_twin_gives(beams: Beams) -> None:
+def test_the_kernel_matches_the_reference(beams: Beams) -> None:
     lidar = Lidar("any", beams, min_range=1.0, max_range=40.0, divergence=(0.01, 0.005), returns=3)
     instances, attributes = scattered()
     poses = driving(lidar, speed=15.0, turn_deg=30.0)
@@ -240,8 +240,8 @@ def test_the_kernel_gives_what_the_twin_gives(beams: Beams) -> None:
         )
         for backend in ("cpu", "reference")
     )
-    # The beam's own width is taken at the instant of the centre: what is at the limit of 1/255
-    # may be met by one and not by the other.
+    # The beam width is evaluated at the time of the centre, so contributions near the limit of
+    # 1/255 may count in only one of the two.
     difference = np.abs(kernel.opacity - twin.opacity)
     assert difference.max() < 4 / 255
     assert np.quantile(difference, 0.98) < 2e-3
@@ -262,7 +262,7 @@ def digest(echo: Echo) -> str:
     return hashlib.sha256(b"".join(image.tobytes() for image in images)).hexdigest()
 
 
-def test_bits_do_not_depend_on_the_number_of_threads() -> None:
+def test_results_do_not_depend_on_the_number_of_threads() -> None:
     instances, attributes = scattered()
     lidar = spinning()
     poses = driving(lidar, speed=15.0, turn_deg=30.0)
@@ -288,7 +288,7 @@ def test_poses_of_another_length_are_refused() -> None:
         cast([], spinning(), np.broadcast_to(np.eye(4), (7, 4, 4)))
 
 
-def test_poses_that_are_no_transforms_are_refused() -> None:
+def test_non_rigid_poses_are_refused() -> None:
     with pytest.raises(RenderError, match="not rigid transforms"):
         cast([], spinning(), np.full((4, 4), np.nan))
 

@@ -1,4 +1,4 @@
-"""The CUDA kernels of cast(), run on the CPU from their own source, meet what the others meet."""
+"""The CUDA kernels of cast(), compiled for the CPU, match the other backends."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ SENSORS = {
 
 
 def sweep(beams: Beams, *, returns: int = 3) -> CastRequest:
-    """Of a sensor that drives and turns, with an object that moves and one that is deformed."""
+    """A sweep of a moving, turning sensor, with a moving and a deformed object."""
     lidar = Lidar(
         "any", beams, min_range=1.0, max_range=40.0, divergence=(0.01, 0.005), returns=returns
     )
@@ -58,7 +58,7 @@ def on_twin(request: CastRequest, *, backwards: bool = False) -> Echo:
 
 
 @pytest.mark.parametrize("sensor", SENSORS)
-def test_rays_meet_what_they_meet_on_the_cpu(sensor: str) -> None:
+def test_kernels_match_the_cpu_backend(sensor: str) -> None:
     request = sweep(SENSORS[sensor])
     found, expected = on_twin(request), select_caster("cpu").cast(request)
     assert expected.opacity.mean() > 0.05
@@ -69,7 +69,7 @@ def test_rays_meet_what_they_meet_on_the_cpu(sensor: str) -> None:
             getattr(found, name), getattr(expected, name), atol=1e-4, err_msg=name
         )
     for name in ("expected", "intensity", "drop"):
-        # Means over what light was stopped: where that is little, its rounding is what is seen.
+        # Weight by opacity: at low opacity the means are dominated by rounding.
         apart = (getattr(found, name) - getattr(expected, name)) * expected.opacity
         assert np.abs(apart).max() < 2e-4
     for name, given in expected.returns.items():
@@ -77,12 +77,12 @@ def test_rays_meet_what_they_meet_on_the_cpu(sensor: str) -> None:
         np.testing.assert_allclose(found.returns[name].power, given.power, atol=2e-4)
 
 
-def test_the_order_of_blocks_and_threads_changes_no_bit() -> None:
+def test_results_do_not_depend_on_block_and_thread_order() -> None:
     request = sweep(SENSORS["spinning"], returns=1)
     assert digest(on_twin(request)) == digest(on_twin(request, backwards=True))
 
 
-def test_a_second_sweep_of_another_size_is_as_if_it_were_alone() -> None:
+def test_sweeps_of_different_sizes_are_independent() -> None:
     small, large = sweep(SENSORS["table"]), sweep(SENSORS["spinning"])
     caster = CudaCaster(CastTwinLauncher())
     digests = [digest(caster.cast(request)) for request in (large, small, large)]
@@ -96,13 +96,13 @@ def test_an_empty_world_gives_no_return() -> None:
     assert (echo.member == -1).all()
 
 
-def test_what_lies_beyond_the_range_is_not_met() -> None:
+def test_objects_outside_the_range_limits_are_not_hit() -> None:
     instances, _ = scattered()
     lidar = Lidar("any", SENSORS["spinning"], min_range=90.0, max_range=100.0)
     assert not on_twin(checked_request(instances, lidar, np.eye(4))).opacity.any()
 
 
-def test_the_structures_are_those_of_the_kernels() -> None:
+def test_structures_match_the_kernel_source() -> None:
     sizes = (ctypes.c_uint32 * 3)()
     cast_twin().sizes(sizes)
     expected = [cuda_cast.MET_BYTES, cuda_cast.BODY.itemsize, cuda_cast.SWEEP.itemsize]
@@ -110,7 +110,7 @@ def test_the_structures_are_those_of_the_kernels() -> None:
 
 
 @pytest.mark.skipif(unmet_nvrtc_need() is None, reason="there is a GPU")
-def test_without_a_gpu_it_is_refused_with_what_it_needs() -> None:
+def test_without_a_gpu_the_missing_requirement_is_named() -> None:
     instances, _ = scattered()
     lidar = Lidar("any", SENSORS["spinning"], min_range=1.0, max_range=40.0)
     with pytest.raises(RenderError, match=r"cast backend 'cuda': .+; .+"):
@@ -121,7 +121,7 @@ def test_without_a_gpu_it_is_refused_with_what_it_needs() -> None:
 @pytest.mark.skipif(
     unmet_nvrtc_need() is not None, reason="no GPU that the kernels can be compiled for"
 )
-def test_a_gpu_meets_what_the_cpu_meets() -> None:
+def test_gpu_results_match_the_cpu() -> None:
     request = sweep(SENSORS["spinning"])
     on_gpu, on_cpu = CudaCaster().cast(request), select_caster("cpu").cast(request)
     assert (on_gpu.member == on_cpu.member).mean() > 0.999

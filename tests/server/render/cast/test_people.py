@@ -1,4 +1,4 @@
-"""LiDARs on walking people, against rays cast at the skinned surface of the same body."""
+"""LiDAR returns of walking people, against rays cast at the skinned body mesh."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from real2sim_server.scene.asset import person_asset
 
 
 def surface(asset, trajectory, t_us):
-    """Vertices [V, 3] in the world, and the triangles."""
+    """Vertices [V, 3] in the world frame, and the triangles."""
     figure = asset.figure
     times = (trajectory.times_us - trajectory.start_us) * 1e-6
     ground = trajectory.positions - [0.0, 0.0, figure.middle]
@@ -27,7 +27,7 @@ def surface(asset, trajectory, t_us):
 
 
 def met(vertices, triangles, directions):
-    """Ranges [R] of rays from the origin, 0 where they meet nothing (Moeller and Trumbore 1997)."""
+    """Ranges [R] of rays from the origin, 0 for misses (Moeller and Trumbore 1997)."""
     a, b, c = (vertices[triangles[:, k]] for k in range(3))
     found = np.zeros(len(directions))
     for k, direction in enumerate(directions):
@@ -46,7 +46,7 @@ def met(vertices, triangles, directions):
 
 @pytest.mark.parametrize("distance", [6.0, 20.0])
 @pytest.mark.parametrize("build", ["woman", "boy"])
-def test_ranges_of_people_are_those_of_their_bodies(build, distance):
+def test_ranges_of_people_match_their_meshes(build, distance):
     asset = person_asset("somebody", build)
     seconds = np.linspace(0, 3, 31)
     way = np.column_stack([0 * seconds + distance, 1.3 * (seconds - 1.5), 0 * seconds])

@@ -1,4 +1,4 @@
-"""Detections of a radar in cases whose answer is known."""
+"""Radar detections in cases with known results."""
 
 from __future__ import annotations
 
@@ -56,10 +56,10 @@ def test_a_target_has_its_range_azimuth_and_velocity():
 @pytest.mark.parametrize(
     ("other", "count"),
     [
-        ((8.15, 0.3, -12.0), 1),  # In the same cell.
-        ((9.1, 0.3, -12.0), 2),  # Apart in range,
-        ((8.1, 2.3, -12.0), 2),  # in azimuth,
-        ((8.1, 0.3, -11.5), 2),  # and in velocity alone.
+        ((8.15, 0.3, -12.0), 1),  # in the same cell
+        ((9.1, 0.3, -12.0), 2),  # separated in range
+        ((8.1, 2.3, -12.0), 2),  # separated in azimuth
+        ((8.1, 0.3, -11.5), 2),  # separated in velocity only
     ],
 )
 def test_resolution_separates_or_merges_two_targets(other, count):
@@ -67,7 +67,7 @@ def test_resolution_separates_or_merges_two_targets(other, count):
     assert len(found) == count
 
 
-def test_merged_targets_add_up_and_lie_in_the_middle_by_power():
+def test_merged_targets_add_their_power_and_average_their_range():
     one = radar_detections(patches(NEAR), radar())
     two = radar_detections(patches(NEAR, (8.15, 0.3, -12.0)), radar())
     assert two.rcs[0] - one.rcs[0] == pytest.approx(3.0, abs=0.1)
@@ -81,7 +81,7 @@ def test_rcs_falls_with_incidence_to_a_floor():
     assert values[0] / values[-1] == pytest.approx(12.5, rel=0.01)
 
 
-def test_rcs_is_that_of_the_class():
+def test_rcs_depends_on_the_class():
     of = {
         name: patch_rcs(patches(NEAR, semantic=SEMANTIC_CLASSES[name]), 1e-4)[0]
         for name in ("truck", "car", "person", "ground")
@@ -89,12 +89,12 @@ def test_rcs_is_that_of_the_class():
     assert of["truck"] > of["car"] > of["person"] > of["ground"]
 
 
-def test_a_reference_target_is_detected_up_to_its_range_and_no_farther():
+def test_a_reference_target_is_detected_up_to_the_detection_range():
     sensor = radar(detection_range_m=100.0)
     solid = sensor.solid_angle
 
     def target(distance):
-        # As many patches in one cell as make up the reference.
+        # Enough patches in one cell to reach the reference RCS.
         one = patch_rcs(patches((distance, 0.3, 0.0)), solid)[0]
         return patches(*[(distance, 0.3, 0.0)] * round(REFERENCE_RCS / one))
 
@@ -105,18 +105,18 @@ def test_a_reference_target_is_detected_up_to_its_range_and_no_farther():
     assert found.snr[0] == pytest.approx(40 * np.log10(100 / 90.1), abs=0.5)
 
 
-def test_targets_that_are_too_small_are_not_reported_however_near():
+def test_targets_below_the_minimum_rcs_are_not_reported():
     near = patches((2.1, 0.3, -12.0))
     assert len(radar_detections(near, radar(min_rcs_dbsm=-40))) == 1
     assert len(radar_detections(near, radar(min_rcs_dbsm=-20))) == 0
 
 
-def test_velocities_beyond_the_largest_fold_back():
+def test_velocities_beyond_the_maximum_are_aliased():
     found = radar_detections(patches((8.1, 0.3, -25.0)), radar(max_velocity_mps=20.0))
     assert found.velocity[0] == pytest.approx(15.0)
 
 
-def test_clutter_has_its_rate_and_its_seed():
+def test_clutter_is_poisson_and_depends_on_the_seed():
     sensor, nothing = radar(clutter_rate=3.0), patches()
     counts = [len(radar_detections(nothing, sensor, seed=k)) for k in range(400)]
     assert np.mean(counts) == pytest.approx(3.0, abs=0.3)
@@ -127,7 +127,7 @@ def test_clutter_has_its_rate_and_its_seed():
     assert len(radar_detections(nothing, radar())) == 0
 
 
-def test_ghosts_are_off_unless_asked_for_and_lie_at_twice_the_range():
+def test_ghosts_are_optional_and_appear_at_twice_the_range():
     assert set(radar_detections(patches(NEAR), radar()).kind) == {0}
     found = radar_detections(patches(NEAR), radar(ghost_rate=1.0))
     ghost = found.kind == GHOST_KIND
@@ -135,7 +135,7 @@ def test_ghosts_are_off_unless_asked_for_and_lie_at_twice_the_range():
     assert found.velocity[ghost] == pytest.approx([-24.0])
 
 
-def test_noise_is_of_the_size_that_the_model_says_and_repeats():
+def test_range_noise_matches_the_model_and_is_reproducible():
     sensor = radar(range_noise_m=0.1, velocity_resolution_mps=0.02, detection_range_m=500.0)
     many = patches(*[(30.1, 0.3, 0.05 * k) for k in range(300)])
     found = radar_detections(many, sensor, seed=3)
@@ -144,6 +144,6 @@ def test_noise_is_of_the_size_that_the_model_says_and_repeats():
     np.testing.assert_array_equal(found.range, again.range)
 
 
-def test_draws_of_poisson():
+def test_poisson_draws_at_both_ends_of_the_rate():
     assert poisson(0.0, 0.999) == 0
     assert poisson(5000.0, 0.5) == pytest.approx(5000, abs=2)

@@ -1,4 +1,4 @@
-"""What rays meet, one by one, and how squarely."""
+"""Individual ray hits, and the effect of incidence."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def sheets(centres: list[list[float]], opacity: float) -> GaussianCloud:
     )
 
 
-def test_ray_hits_make_up_the_echo() -> None:
+def test_ray_hits_compose_the_echo() -> None:
     bodies = [
         Instance(sheets([[5.0, 0, 0], [20.0, 1, 0]], 0.4)),
         Instance(sheets([[9.0, 0, 0]], 0.7)),
@@ -44,8 +44,8 @@ def test_ray_hits_make_up_the_echo() -> None:
         assert (weight * tau).sum() / weight.sum() == pytest.approx(echo.expected[ray], rel=1e-5)
 
 
-def test_rays_are_followed_up_to_their_reach() -> None:
-    # What is opaque before it hides nothing: what lies behind may have to become opaque.
+def test_rays_are_traced_up_to_their_reach() -> None:
+    # Opaque Gaussians do not end a trace, since training may have to make those behind opaque.
     body = Instance(sheets([[5.0, 0, 0], [9.0, 0, 0], [20.0, 0, 0]], 0.99))
     request = checked_request([body], LIDAR, np.eye(4))
     found = CpuCaster().trace(request, np.full(40, 12.0, np.float32))
@@ -53,7 +53,7 @@ def test_rays_are_followed_up_to_their_reach() -> None:
     assert (np.diff(found.begins) == 2).all()
 
 
-def test_slanting_light_is_sent_back_less() -> None:
+def test_oblique_incidence_lowers_intensity() -> None:
     body = Instance(sheets([[10.0, 0, 0], [10.0, 10, 0]], 0.9))
     lidar = Lidar("two", Beams([0.0, np.pi / 4], [0.0, 0.0], [0.0, 0.0]))
     known = [np.array([[0.8, 0], [0.8, 0]], np.float32)]
@@ -63,6 +63,6 @@ def test_slanting_light_is_sent_back_less() -> None:
     assert np.allclose(partly.intensity, [0.8, 0.8 * (0.25 + 0.75 * np.sqrt(0.5))], atol=1e-3)
 
 
-def test_a_share_that_is_none_is_refused() -> None:
+def test_an_incidence_outside_0_to_1_is_refused() -> None:
     with pytest.raises(RenderError, match=r"incidence must be from 0 to 1, not 1\.5"):
         cast([], LIDAR, np.eye(4), incidence=1.5)

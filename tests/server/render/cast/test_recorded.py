@@ -1,4 +1,4 @@
-"""Sweeps through scenes as recorded."""
+"""Sweeps through recorded scenes."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def path(start: float, speed: float) -> Trajectory:
 
 @pytest.fixture
 def scene() -> Scene:
-    """A sheet ahead that drives away at 10 m/s, before a wall; the ego follows at 5 m/s."""
+    """A sheet ahead that moves away at 10 m/s, in front of a wall. The ego follows at 5 m/s."""
     car = SceneObject("car_0", "car", (1, 6, 6), slab(0.0), path(12.0, 10.0))
     return Scene(
         name="made",
@@ -66,7 +66,7 @@ LIDAR = Lidar("any", Beams.spinning([0.0], columns=64), max_range=100.0)
 AHEAD = int(np.abs(LIDAR.beams.azimuth[0]).argmin())
 
 
-def test_everything_is_where_it_is_at_the_rays_own_instant(scene: Scene) -> None:
+def test_ego_and_objects_are_posed_at_the_time_of_each_ray(scene: Scene) -> None:
     echo = recorded_sweep(scene, LIDAR, 500_000)
     seconds = 0.5 + LIDAR.beams.time_us[0, AHEAD] * 1e-6
     expected = (12 + 10 * seconds - 5 * seconds) / np.cos(LIDAR.beams.azimuth[0, AHEAD])
@@ -74,7 +74,7 @@ def test_everything_is_where_it_is_at_the_rays_own_instant(scene: Scene) -> None
     assert echo.instance[0, AHEAD] == 1
 
 
-def test_edits_change_what_a_sweep_meets(scene: Scene) -> None:
+def test_edits_change_the_sweep(scene: Scene) -> None:
     state = ScenarioState.of(scene)
     deleted = apply_operations(state, [Delete(object_id="car_0")]).state
     region = EraseRegion(
@@ -91,7 +91,7 @@ def test_edits_change_what_a_sweep_meets(scene: Scene) -> None:
     assert hits[2] == 0
 
 
-def test_surfaces_for_lidars_are_met_instead(scene: Scene) -> None:
+def test_lidar_surfaces_replace_the_gaussians(scene: Scene) -> None:
     def reflector(x: float, reflectivity: float) -> Reflector:
         return Reflector(slab(x), torch.tensor([[reflectivity, 0.0]]))
 
@@ -102,12 +102,12 @@ def test_surfaces_for_lidars_are_met_instead(scene: Scene) -> None:
     assert echo.intensity[0, AHEAD] == pytest.approx(0.25, abs=0.01)
 
 
-def test_a_path_goes_straight_on_beyond_its_ends() -> None:
+def test_a_path_extends_straight_beyond_its_ends() -> None:
     poses = transforms_at(path(3.0, 10.0), np.array([-50_000.0, 500_000.0, 1_050_000.0]))
     assert np.allclose(poses[:, 0, 3], [2.5, 8.0, 13.5])
 
 
-def test_a_sweep_is_written_as_points_arrays_and_a_picture(scene: Scene, tmp_path) -> None:  # type: ignore[no-untyped-def]
+def test_a_sweep_is_written_as_ply_npz_and_png(scene: Scene, tmp_path) -> None:  # type: ignore[no-untyped-def]
     sweep = detect(recorded_sweep(scene, LIDAR, 500_000), LIDAR)
     count = int(sweep.hit.sum())
     head, _, body = ply_bytes(sweep).partition(b"end_header\n")

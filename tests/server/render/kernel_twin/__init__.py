@@ -1,9 +1,8 @@
-"""The serving kernels on the CPU: their own source, compiled as C++.
+"""The serving kernels on the CPU: the CUDA source, compiled as C++.
 
-``cuda_on_cpu.h`` stands in for CUDA, fibers for the threads of a block. So what the tests look at
-is the source that a GPU runs, line for line, with its barriers and its sums within a warp; not a
-second text that may differ from it. Needs g++, as CI's machines have it; tests skip where it is
-not.
+``cuda_on_cpu.h`` replaces CUDA, and fibers replace the threads of a block. The tests therefore run
+the GPU source itself, including its barriers and warp sums. This requires g++. Tests skip without
+it.
 """
 
 from __future__ import annotations
@@ -41,14 +40,14 @@ def compiled_twin(
     flags: Sequence[str] = (),
     made: Mapping[str, str] | None = None,
 ) -> ctypes.CDLL:
-    """Kernels compiled for the CPU; compiled once for each state of what they are made of.
+    """Compile kernels for the CPU, cached by the content of their sources and flags.
 
     Args:
-        name: of what is kept on the disk.
-        main: that includes all else, from the folders of ``sources``.
+        name: prefix of the cached library.
+        main: source file that includes all others, from the folders of ``sources``.
         sources: the kernels, and the headers in their folders.
-        flags: of the compiler, beside those of all.
-        made: headers that are in no folder, by name.
+        flags: additional compiler flags.
+        made: text of generated headers by file name.
     """
     made = made or {}
     files = sorted({main, *sources, *HERE.glob("*.h")})
@@ -85,10 +84,10 @@ def twin() -> ctypes.CDLL:
 
 
 class KernelTwin:
-    """What launchers have in common that run kernels on the CPU.
+    """Base class of launchers that run kernels on the CPU.
 
     Args:
-        kernels: gives what was compiled.
+        kernels: returns the compiled library.
         backwards: run blocks, and the threads of each, in the opposite order.
 
     Attributes:
@@ -114,11 +113,11 @@ class KernelTwin:
         return torch.empty(nbytes, dtype=torch.uint8)
 
     def wait(self) -> None:
-        """Everything is done when it is launched."""
+        """Launches are synchronous."""
 
 
 class TwinLauncher(KernelTwin):
-    """A Launcher of the renderer that runs the serving kernels on the CPU."""
+    """A launcher of the renderer that runs the serving kernels on the CPU."""
 
     def __init__(self, *, backwards: bool = False) -> None:
         super().__init__(twin, backwards=backwards)
@@ -127,7 +126,7 @@ class TwinLauncher(KernelTwin):
         lock, copied = threading.Lock(), []
 
         def copy() -> None:
-            """Once, as late as may be, so that who reads before is found out."""
+            """Copy once, as late as possible, to reveal readers that do not wait."""
             with lock:
                 if not copied:
                     copied.append(target.copy_(source))

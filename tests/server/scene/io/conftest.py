@@ -1,4 +1,4 @@
-"""Bundles to test with."""
+"""Test bundles."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What every splat format has to do, whichever Gaussians it is given and whatever it rounds."""
+"""The contract of splat formats."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MakeCloud = Callable[..., GaussianCloud]
 
 
 def check_description(splat_format: SplatFormat) -> None:
-    """Its name and suffix are its own, and it claims no file that is not its."""
+    """Name and suffix are unique, and foreign files are not recognised."""
     others = [known for known in FORMATS if known is not splat_format]
     assert splat_format.name not in {known.name for known in others}
     assert splat_format.suffix not in {known.suffix for known in others}
@@ -30,7 +30,7 @@ def check_description(splat_format: SplatFormat) -> None:
 
 
 def check_file_is_its_own(splat_format: SplatFormat, cloud: GaussianCloud, folder: Path) -> None:
-    """The signature of what it writes is known to it and to none that is asked earlier."""
+    """Written files are recognised by their own format first."""
     path = folder / f"named{splat_format.suffix}"
     write_splats(cloud, path)
     head = path.read_bytes()[: 1 << 16]
@@ -39,7 +39,7 @@ def check_file_is_its_own(splat_format: SplatFormat, cloud: GaussianCloud, folde
 
 
 def check_round_trip(splat_format: SplatFormat, make_cloud: MakeCloud, folder: Path) -> None:
-    """Valid Gaussians come back, as many as were written, about where they were."""
+    """Written Gaussians are read back: valid, complete and near their positions."""
     for degree in range(4):
         cloud = make_cloud(300, degree=degree)
         path = folder / f"{degree}{splat_format.suffix}"
@@ -53,7 +53,7 @@ def check_round_trip(splat_format: SplatFormat, make_cloud: MakeCloud, folder: P
 
 
 def check_same_bytes(splat_format: SplatFormat, make_cloud: MakeCloud, folder: Path) -> None:
-    """The same Gaussians give the same file."""
+    """Equal Gaussians give equal files."""
     written = []
     for name in "ab":
         path = folder / f"{name}{splat_format.suffix}"
@@ -63,7 +63,7 @@ def check_same_bytes(splat_format: SplatFormat, make_cloud: MakeCloud, folder: P
 
 
 def check_damage_is_refused(splat_format: SplatFormat, cloud: GaussianCloud, folder: Path) -> None:
-    """A file that was cut short is refused with its name."""
+    """A truncated file is refused with its name."""
     path = folder / f"cut{splat_format.suffix}"
     write_splats(cloud, path)
     data = path.read_bytes()
@@ -73,7 +73,7 @@ def check_damage_is_refused(splat_format: SplatFormat, cloud: GaussianCloud, fol
 
 
 def check_contract(splat_format: SplatFormat, make_cloud: MakeCloud, folder: Path) -> None:
-    """All of the above."""
+    """Run all checks of the contract."""
     check_description(splat_format)
     check_file_is_its_own(splat_format, make_cloud(20), folder)
     check_round_trip(splat_format, make_cloud, folder)

@@ -1,4 +1,4 @@
-"""A reader of binary glTF for tests, after the specification and apart from the writer."""
+"""A binary glTF reader for tests, written from the specification and independent of the writer."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 
 
 class Glb:
-    """A parsed file whose layout has been checked."""
+    """A parsed file with a validated layout."""
 
     def __init__(self, path: Path) -> None:
         data = path.read_bytes()
@@ -90,7 +90,7 @@ class Glb:
         return matrix
 
     def shown(self, name: str, seconds: float) -> bool:
-        """Whether the scale of a node is not zero; STEP keeps a value until the next key."""
+        """Whether the scale of a node is nonzero. STEP holds a value until the next key."""
         if "scale" not in self.channels(name):
             return True
         times, values, interpolation = self.channels(name)["scale"]
@@ -117,7 +117,7 @@ def sample(times: np.ndarray, values: np.ndarray, seconds: float, *, spherical: 
 
 
 def rotation_matrix(xyzw: np.ndarray) -> np.ndarray:
-    """Rotation [3, 3] of a quaternion in glTF order, as the extension prints it."""
+    """Rotation [3, 3] of a quaternion in glTF order, as given in the extension."""
     x, y, z, w = xyzw / np.linalg.norm(xyzw)
     return np.array(
         [

@@ -1,4 +1,4 @@
-"""Small clouds for property tests, and how far apart two clouds are."""
+"""Small clouds for property tests, and distances between clouds."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from real2sim_server.scene import GaussianCloud
 
 @dataclass(frozen=True)
 class Recipe:
-    """How to make a cloud: short to print where a property fails, and hypothesis shrinks it."""
+    """Parameters of a random cloud, which Hypothesis can print and shrink."""
 
     count: int
     degree: int
@@ -44,7 +44,7 @@ class Recipe:
 def recipes(
     *, sh_reach: float = 1.0, spreads: tuple[float, ...] = (0.0, 1e-3, 1.0, 100.0)
 ) -> st.SearchStrategy[Recipe]:
-    """Up to 600 Gaussians of any degree, at and around the size of a chunk."""
+    """Recipes of up to 600 Gaussians of any degree, with counts around the chunk size."""
     return st.builds(
         Recipe,
         count=st.sampled_from([0, 1, 2, 255, 256, 257, 600]),
@@ -61,7 +61,7 @@ def rotation_angles(a: GaussianCloud, b: GaussianCloud) -> np.ndarray:
     """Angles [N] [rad] between the rotations of two clouds."""
     left = quaternion_to_matrix(a.quats.double().numpy())
     right = quaternion_to_matrix(b.quats.double().numpy())
-    # Twice the sine of half the angle times sqrt(2): exact for small angles too.
+    # The chord is 2 sqrt(2) sin(angle / 2), accurate for small angles.
     chord = np.linalg.norm(left - right, axis=(1, 2)) / np.sqrt(8)
     return 2 * np.arcsin(np.clip(chord, 0, 1))
 
@@ -73,10 +73,10 @@ def covariances(cloud: GaussianCloud) -> np.ndarray:
 
 
 def largest_turn(step: float) -> float:
-    """Angle [rad] that rounding three small parts of a quaternion to ``step`` may turn at most.
+    """Largest rotation error [rad] when the three small parts of a quaternion round to ``step``.
 
-    The parts are off by step / 2 each; the fourth follows from unit length and is off by
-    sqrt(1 - w^2) / w times as much as these together, which is largest for w = 1/2. An angle is
-    twice the distance of unit quaternions.
+    Each small part has an error of step / 2. The fourth follows from unit length, and its error is
+    sqrt(1 - w^2) / w times their norm, largest for w = 1/2. An angle is twice the distance between
+    unit quaternions.
     """
     return 2 * np.sqrt(3 + 9) * step / 2 * 1.01

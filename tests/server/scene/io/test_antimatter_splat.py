@@ -15,7 +15,7 @@ def record(
     return struct.pack("<6f8B", *position, *scale, *rgba, *rotation)
 
 
-def test_a_record_is_decoded_as_described(tmp_path):
+def test_records_are_decoded_as_specified(tmp_path):
     (tmp_path / "a.splat").write_bytes(record() + record(rotation=(128, 192, 128, 64)))
     cloud = read_splats(tmp_path / "a.splat")
     cloud.check_values("cloud")
@@ -28,7 +28,7 @@ def test_a_record_is_decoded_as_described(tmp_path):
     np.testing.assert_allclose(cloud.quats[1], [0, 0.5**0.5, 0, -(0.5**0.5)], atol=1e-6)
 
 
-def test_a_scale_of_zero_becomes_the_smallest_there_is(tmp_path):
+def test_zero_scales_become_the_smallest_positive_scale(tmp_path):
     (tmp_path / "a.splat").write_bytes(record(scale=(0, 1, 1)))
     read_splats(tmp_path / "a.splat").check_values("cloud")
 
@@ -45,13 +45,13 @@ def test_a_scale_of_zero_becomes_the_smallest_there_is(tmp_path):
         (record(rotation=(128,) * 4), "1 of 1 rotations have length zero"),
     ],
 )
-def test_damage_is_refused(tmp_path, data, reason):
+def test_damaged_files_are_refused(tmp_path, data, reason):
     (tmp_path / "a.splat").write_bytes(data)
     with pytest.raises(BundleError, match=rf"a\.splat: {reason}"):
         read_splats(tmp_path / "a.splat")
 
 
-def test_without_its_suffix_nothing_tells_such_a_file(tmp_path):
+def test_a_splat_file_is_recognised_only_by_its_suffix(tmp_path):
     (tmp_path / "a.bin").write_bytes(record())
     with pytest.raises(BundleError, match="not a ply nor any other known"):
         read_splats(tmp_path / "a.bin")

@@ -52,7 +52,7 @@ def assert_same_camera(a: Camera, b: Camera) -> None:
     assert a.T_vehicle_camera.tobytes() == b.T_vehicle_camera.tobytes()
 
 
-def test_a_scene_comes_back_bit_for_bit(scene, tmp_path):
+def test_a_scene_round_trips_exactly(scene, tmp_path):
     saved = save_scene(scene, tmp_path / "a.r2s")
     loaded = load_scene(tmp_path / "a.r2s")
     assert loaded.name == scene.name
@@ -72,7 +72,7 @@ def test_a_scene_comes_back_bit_for_bit(scene, tmp_path):
         assert_same_trajectory(a.trajectory, b.trajectory)
 
 
-def test_a_scene_of_nothing_comes_back(scene, tmp_path):
+def test_an_empty_scene_round_trips(scene, tmp_path):
     bare = replace(
         scene,
         background=GaussianCloud.empty(sh_degree=3),
@@ -100,7 +100,7 @@ def test_views_of_larger_tensors_are_saved(scene, tmp_path, make_cloud):
     assert_same_cloud(load_scene(tmp_path / "a").background, every_other)
 
 
-def test_loading_without_verification_gives_the_same(scene, bundle):
+def test_loading_without_verification_gives_the_same_scene(scene, bundle):
     assert_same_cloud(load_scene(bundle, verify=False).background, scene.background)
 
 
@@ -110,7 +110,7 @@ def test_a_loaded_scene_outlives_its_folder(scene, bundle):
     assert_same_cloud(loaded.background, scene.background)
 
 
-def test_a_bundle_needs_nothing_outside_its_folder(scene, bundle, tmp_path):
+def test_a_bundle_can_be_moved(scene, bundle, tmp_path):
     moved = tmp_path / "elsewhere" / "renamed"
     moved.parent.mkdir()
     bundle.rename(moved)
@@ -120,7 +120,7 @@ def test_a_bundle_needs_nothing_outside_its_folder(scene, bundle, tmp_path):
 # Content hash
 
 
-def test_equal_scenes_have_equal_hashes_wherever_they_lie(scene, tmp_path):
+def test_equal_scenes_have_equal_hashes(scene, tmp_path):
     copy = replace(
         scene,
         name="another name",
@@ -133,12 +133,12 @@ def test_equal_scenes_have_equal_hashes_wherever_they_lie(scene, tmp_path):
     assert len(first.content_hash) == 64
 
 
-def test_saving_what_was_loaded_keeps_the_hash(bundle, tmp_path):
+def test_saving_a_loaded_scene_keeps_the_hash(bundle, tmp_path):
     loaded = load_scene(bundle)
     assert save_scene(loaded, tmp_path / "again").content_hash == loaded.content_hash
 
 
-def test_lenses_and_shutters_come_back_bit_for_bit(scene, tmp_path):
+def test_lenses_and_shutters_round_trip_exactly(scene, tmp_path):
     lens, shutter = Fisheye((0.1, -0.01, 0.0, 1 / 3), 1.6), Shutter("right_to_left", 20_000)
     known = Optics(scene.rig["rear"].K * [[1.1], [1.1], [1]], BrownConrady(), shutter)
     front, rear = scene.rig
@@ -151,12 +151,12 @@ def test_lenses_and_shutters_come_back_bit_for_bit(scene, tmp_path):
     assert (read["rear"].recorded.lens, read["rear"].recorded.shutter) == (known.lens, shutter)
 
 
-def test_pinholes_are_written_without_optics(bundle):
+def test_pinhole_cameras_are_written_without_optics(bundle):
     document = json.loads((bundle / "scene.json").read_text())
     assert all(set(c) == CAMERA_KEYS for c in document["content"]["cameras"])
 
 
-def test_the_order_of_keys_in_the_json_does_not_matter(scene, bundle):
+def test_json_key_order_does_not_matter(scene, bundle):
     file = bundle / "scene.json"
     file.write_text(json.dumps(json.loads(file.read_text()), sort_keys=True, indent=2))
     assert load_scene(bundle).name == scene.name
@@ -203,7 +203,7 @@ CHANGES = {
 
 
 @pytest.mark.parametrize("what", CHANGES)
-def test_every_part_of_a_scene_counts_for_the_hash(scene, tmp_path, what):
+def test_the_hash_covers_every_part_of_a_scene(scene, tmp_path, what):
     plain = save_scene(scene, tmp_path / "plain")
     changed = save_scene(CHANGES[what](scene), tmp_path / "changed")
     assert plain.content_hash != changed.content_hash
@@ -212,7 +212,7 @@ def test_every_part_of_a_scene_counts_for_the_hash(scene, tmp_path, what):
 # Summary
 
 
-def test_the_summary_tells_what_the_scene_holds(scene, bundle):
+def test_the_summary_describes_the_scene(scene, bundle):
     summary = read_scene_summary(bundle)
     assert summary.name == scene.name
     assert summary.content_hash == load_scene(bundle).content_hash
@@ -229,7 +229,7 @@ def test_the_summary_tells_what_the_scene_holds(scene, bundle):
     assert loaded.nbytes <= summary.nbytes < loaded.nbytes + 4096
 
 
-def test_the_summary_needs_no_tensor_files(bundle):
+def test_the_summary_does_not_need_tensor_files(bundle):
     for file in bundle.glob("*.safetensors"):
         file.unlink()
     assert read_scene_summary(bundle).name == "street"
@@ -243,7 +243,7 @@ def asset(make_cloud) -> Asset:
     return Asset("taxi", "car", (4.4, 1.8, 1.5), make_cloud(33, degree=3), {"source": "test"})
 
 
-def test_an_asset_comes_back_bit_for_bit(asset, tmp_path):
+def test_an_asset_round_trips_exactly(asset, tmp_path):
     saved = save_asset(asset, tmp_path / "taxi.r2s")
     loaded = load_asset(tmp_path / "taxi.r2s")
     assert (loaded.asset_id, loaded.category, loaded.size) == ("taxi", "car", (4.4, 1.8, 1.5))
@@ -252,7 +252,7 @@ def test_an_asset_comes_back_bit_for_bit(asset, tmp_path):
     assert_same_cloud(loaded.cloud, asset.cloud)
 
 
-def test_a_scene_is_no_asset_and_an_asset_no_scene(asset, bundle, tmp_path):
+def test_scenes_and_assets_are_not_interchangeable(asset, bundle, tmp_path):
     save_asset(asset, tmp_path / "taxi.r2s")
     with pytest.raises(BundleError, match="kind 'scene', not 'asset'"):
         load_asset(bundle)

@@ -19,20 +19,20 @@ def test_a_missing_folder_is_named(tmp_path):
         load_scene(tmp_path / "nothing.r2s")
 
 
-def test_a_folder_without_json_is_no_bundle(tmp_path):
+def test_a_folder_without_json_is_refused(tmp_path):
     with pytest.raises(BundleError, match=r"no bundle, it has no scene.json"):
         load_scene(tmp_path)
 
 
 @pytest.mark.parametrize("read", [load_scene, read_scene_summary])
-def test_another_version_is_refused_with_both_versions_and_what_to_do(bundle, read):
+def test_an_unsupported_version_is_refused_with_a_remedy(bundle, read):
     edit_json(bundle, version=8, content={"unheard": "of"})
     with pytest.raises(BundleError, match=r"version 8 .* reads version 1\. Update real2sim"):
         read(bundle)
 
 
 @pytest.mark.parametrize("version", [0, 2, "1", 1.0, None, True])
-def test_what_is_no_version_is_refused(bundle, version):
+def test_invalid_versions_are_refused(bundle, version):
     edit_json(bundle, version=version)
     with pytest.raises(BundleError, match=r"version .* reads version 1"):
         load_scene(bundle)
@@ -56,7 +56,7 @@ def test_a_truncated_json_is_refused(bundle, keep):
     "text",
     ["[]", "3", '"x"', "[" * 100_000, '{"format": NaN}', "\ud800".encode("utf-8", "replace")],
 )
-def test_other_json_is_refused(bundle, text):
+def test_unrelated_json_is_refused(bundle, text):
     data = text if isinstance(text, bytes) else text.encode()
     (bundle / "scene.json").write_bytes(data)
     with pytest.raises(BundleError, match=r"scene.json"):
@@ -78,7 +78,7 @@ def test_a_missing_tensor_file_is_refused(bundle, name):
         load_scene(bundle)
 
 
-def test_a_link_in_place_of_a_tensor_file_is_refused(bundle, tmp_path):
+def test_a_symlink_to_a_tensor_file_is_refused(bundle, tmp_path):
     file = bundle / "background.safetensors"
     file.rename(tmp_path / "outside")
     file.symlink_to(tmp_path / "outside")
@@ -87,7 +87,7 @@ def test_a_link_in_place_of_a_tensor_file_is_refused(bundle, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["background", "objects", "sky"])
-def test_one_flipped_bit_in_a_tensor_is_found(bundle, name):
+def test_a_flipped_bit_in_a_tensor_is_detected(bundle, name):
     file = bundle / f"{name}.safetensors"
     data = bytearray(file.read_bytes())
     data[-3] ^= 1
@@ -106,7 +106,7 @@ def test_a_damaged_safetensors_header_is_refused(bundle):
         load_scene(bundle)
 
 
-def test_a_changed_track_is_found(bundle):
+def test_a_changed_track_is_detected(bundle):
     content = json.loads((bundle / "scene.json").read_text())["content"]
     content["ego"]["trajectory"]["positions"][0][0] += 1.0
     edit_json(bundle, content=content)
@@ -122,7 +122,7 @@ def content_of(bundle: Path) -> dict:
     return json.loads((bundle / "scene.json").read_text())["content"]
 
 
-def test_counts_that_do_not_fit_the_tensors_are_refused(bundle):
+def test_counts_that_do_not_match_the_tensors_are_refused(bundle):
     content = content_of(bundle)
     content["background"]["gaussians"] = 10**15
     rehash(bundle, content)
@@ -130,7 +130,7 @@ def test_counts_that_do_not_fit_the_tensors_are_refused(bundle):
         load_scene(bundle)
 
 
-def test_two_objects_of_one_id_are_refused(bundle):
+def test_duplicate_object_ids_are_refused(bundle):
     content = content_of(bundle)
     content["objects"][1]["object_id"] = content["objects"][0]["object_id"]
     rehash(bundle, content)
@@ -153,7 +153,7 @@ def test_two_objects_of_one_id_are_refused(bundle):
         (("surprise",), 1, "surprise"),
     ],
 )
-def test_wrong_content_with_a_right_hash_is_refused(bundle, place, value, reason):
+def test_invalid_content_with_a_valid_hash_is_refused(bundle, place, value, reason):
     content = content_of(bundle)
     part = content
     for key in place[:-1]:
@@ -164,7 +164,7 @@ def test_wrong_content_with_a_right_hash_is_refused(bundle, place, value, reason
         load_scene(bundle)
 
 
-def test_file_names_in_the_json_lead_nowhere(bundle, tmp_path):
+def test_file_names_in_the_json_are_not_followed(bundle, tmp_path):
     outside = tmp_path / "outside.safetensors"
     (bundle / "background.safetensors").rename(outside)
     size = outside.stat().st_size

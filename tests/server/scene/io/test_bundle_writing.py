@@ -21,7 +21,7 @@ def test_an_existing_bundle_is_replaced_with_overwrite(scene, bundle, tmp_path):
     assert [f.name for f in tmp_path.iterdir()] == ["street.r2s"]
 
 
-def test_a_folder_with_other_things_is_never_replaced(scene, tmp_path):
+def test_a_folder_with_other_files_is_never_replaced(scene, tmp_path):
     (tmp_path / "thesis.tex").write_text("years of work")
     with pytest.raises(BundleError, match="never replaced"):
         save_scene(scene, tmp_path, overwrite=True)
@@ -34,16 +34,14 @@ def test_a_file_is_never_replaced(scene, tmp_path):
         save_scene(scene, tmp_path / "file", overwrite=True)
 
 
-def test_an_empty_folder_is_filled(scene, tmp_path):
+def test_a_scene_can_be_saved_to_an_empty_folder(scene, tmp_path):
     (tmp_path / "new").mkdir()
     save_scene(scene, tmp_path / "new")
     assert load_scene(tmp_path / "new").name == "street"
 
 
 @pytest.mark.parametrize("failing", ["write_tensors", "write_text", "rename"])
-def test_a_failure_while_writing_leaves_the_old_bundle(
-    scene, bundle, tmp_path, monkeypatch, failing
-):
+def test_a_failed_write_keeps_the_old_bundle(scene, bundle, tmp_path, monkeypatch, failing):
     def fail(*args: object, **kwargs: object) -> None:
         raise OSError(28, "no space left on device")
 
@@ -63,11 +61,11 @@ def test_a_failure_while_writing_leaves_the_old_bundle(
     assert [f.name for f in tmp_path.iterdir()] == ["street.r2s"]
 
 
-def test_tensor_files_are_readable_by_whom_the_json_is(bundle):
+def test_all_files_have_the_same_permissions(bundle):
     assert len({file.stat().st_mode for file in bundle.iterdir()}) == 1
 
 
-def test_values_that_are_not_finite_are_not_written(scene, tmp_path):
+def test_non_finite_values_are_not_written(scene, tmp_path):
     means = scene.object("car_3").cloud.means.clone()
     means[4, 1] = float("nan")
     car = replace(scene.object("car_3"), cloud=replace(scene.object("car_3").cloud, means=means))
@@ -78,7 +76,7 @@ def test_values_that_are_not_finite_are_not_written(scene, tmp_path):
 
 
 @pytest.mark.parametrize("value", [np.float64(1).reshape(1), {1, 2}, float("nan")])
-def test_provenance_that_is_no_json_is_not_written(scene, tmp_path, value):
+def test_provenance_that_is_not_json_is_not_written(scene, tmp_path, value):
     with pytest.raises(SceneError, match="JSON values only"):
         save_scene(replace(scene, provenance={"x": value}), tmp_path / "bad")
     assert not list(tmp_path.iterdir())

@@ -1,4 +1,4 @@
-"""Whatever happens to a file, reading it either works or says BundleError."""
+"""Reading a damaged file either works or raises BundleError."""
 
 import contextlib
 from pathlib import Path
@@ -43,7 +43,7 @@ def inria_ply() -> bytes:
 
 
 @pytest.mark.parametrize("original", [inria_ply(), compressed_ply()], ids=["inria", "playcanvas"])
-def test_damaged_splat_files(original, tmp_path_factory):
+def test_damaged_splat_files_raise_only_bundle_errors(original, tmp_path_factory):
     file = tmp_path_factory.mktemp("damage") / "a.ply"
     file.write_bytes(original)
     read_splats(file)
@@ -60,7 +60,7 @@ def test_damaged_splat_files(original, tmp_path_factory):
 
 @pytest.mark.parametrize("verify", [True, False])
 @pytest.mark.parametrize("name", ["scene.json", "background.safetensors"])
-def test_damaged_bundles(bundle: Path, name, verify):
+def test_damaged_bundles_raise_only_bundle_errors(bundle: Path, name, verify):
     file = bundle / name
     original = file.read_bytes()
 

@@ -30,7 +30,7 @@ def extent(cloud):
 
 
 @pytest.mark.parametrize("name", SPLATS)
-def test_a_baked_scene_holds_everything_where_it_was(scene, t_us, tmp_path, name):
+def test_a_baked_scene_holds_all_gaussians_at_their_poses(scene, t_us, tmp_path, name):
     (file,) = export_scene(scene, tmp_path / f"a.{name}", format=name, t_us=t_us)
     back = import_splats(file, name="a").background
     expected = [scene.background.means.numpy()]
@@ -40,9 +40,9 @@ def test_a_baked_scene_holds_everything_where_it_was(scene, t_us, tmp_path, name
     expected = np.concatenate(expected)
     assert len(back) == len(expected) == scene.gaussian_count
     given = back.means.numpy()
-    # Some formats reorder: each point has its own in the other.
+    # Some formats reorder Gaussians, so match the nearest points in both directions.
     distances = np.linalg.norm(given[:, None] - expected[None], axis=2)
-    # A chunk spans about 60 m, which compressed ply cuts into 1023 steps across and more along.
+    # A chunk spans about 60 m, and compressed ply quantises it to at least 1023 steps.
     assert distances.min(axis=0).max() < (0.06 if name == "compressed.ply" else 4e-4)
     assert distances.min(axis=1).max() < (0.06 if name == "compressed.ply" else 4e-4)
 
@@ -51,7 +51,7 @@ def test_a_baked_scene_holds_everything_where_it_was(scene, t_us, tmp_path, name
     ("name", "axis", "within"),
     [("spz", "y", 1e-3), ("ply", "z", 1e-6), ("compressed.ply", "z", 0.06), ("splat", "z", 1e-6)],
 )
-def test_what_the_command_exports_it_imports_as_it_was(scene, t_us, tmp_path, name, axis, within):
+def test_exported_files_import_with_the_same_extent(scene, t_us, tmp_path, name, axis, within):
     save_scene(scene, tmp_path / "a.r2s")
 
     def run(*words):
@@ -68,7 +68,7 @@ def test_what_the_command_exports_it_imports_as_it_was(scene, t_us, tmp_path, na
     assert extent(load_scene(tmp_path / "b.r2s").background) == pytest.approx(expected, abs=within)
 
 
-def test_a_baked_ply_equals_the_clouds_moved_to_the_world(scene, t_us, tmp_path):
+def test_a_baked_ply_holds_the_clouds_in_the_world_frame(scene, t_us, tmp_path):
     export_scene(scene, tmp_path / "a.ply", format="ply", t_us=t_us)
     back, expected = read_splats(tmp_path / "a.ply"), bake(scene, t_us)
     assert torch.equal(back.means, expected.means)
@@ -78,7 +78,7 @@ def test_a_baked_ply_equals_the_clouds_moved_to_the_world(scene, t_us, tmp_path)
     assert torch.equal(back.means[n : n + len(placed)], placed.means)
 
 
-def test_objects_that_do_not_exist_then_are_left_out(scene, tmp_path):
+def test_objects_absent_at_the_time_are_omitted(scene, tmp_path):
     late = scene.end_us
     gone = scene.objects["car_3"]
     first = gone.trajectory
@@ -88,7 +88,7 @@ def test_objects_that_do_not_exist_then_are_left_out(scene, tmp_path):
     assert len(read_splats(tmp_path / "a.ply")) == scene.gaussian_count - len(gone.cloud)
 
 
-def test_only_the_objects_asked_for_are_baked(scene, t_us, tmp_path):
+def test_only_requested_objects_are_baked(scene, t_us, tmp_path):
     export_scene(scene, tmp_path / "a.ply", format="ply", t_us=t_us, objects=["car_3"])
     expected = len(scene.background) + len(scene.objects["car_3"].cloud)
     assert len(read_splats(tmp_path / "a.ply")) == expected
@@ -97,7 +97,7 @@ def test_only_the_objects_asked_for_are_baked(scene, t_us, tmp_path):
 
 
 @pytest.mark.parametrize(("up_axis", "file_up"), [("z", 2), ("y", 1)])
-def test_the_axis_asked_for_points_up(scene, t_us, tmp_path, up_axis, file_up):
+def test_the_requested_axis_points_up(scene, t_us, tmp_path, up_axis, file_up):
     scene.background.means[:, 2] += 1000
     export_scene(scene, tmp_path / "a.ply", format="ply", t_us=t_us, up_axis=up_axis)
     assert read_splats(tmp_path / "a.ply").means[:100].mean(0)[file_up] > 900
@@ -106,7 +106,7 @@ def test_the_axis_asked_for_points_up(scene, t_us, tmp_path, up_axis, file_up):
 
 
 @pytest.mark.parametrize("name", SPLATS)
-def test_objects_become_files_in_their_own_frame(scene, tmp_path, name):
+def test_objects_are_exported_as_files_in_their_own_frame(scene, tmp_path, name):
     files = export_scene(scene, tmp_path / "out", format=name)
     assert sorted(f.name for f in files) == sorted(p.name for p in (tmp_path / "out").iterdir())
     index = json.loads((tmp_path / "out" / "objects.json").read_bytes())
@@ -123,14 +123,14 @@ def test_objects_become_files_in_their_own_frame(scene, tmp_path, name):
         assert (entry["category"], tuple(entry["size"])) == (expected.category, expected.size)
 
 
-def test_ids_cannot_lead_out_of_the_folder(scene, tmp_path):
+def test_object_ids_cannot_escape_the_folder(scene, tmp_path):
     files = export_scene(scene, tmp_path / "out", format="ply")
     assert all(f.parent == tmp_path / "out" for f in files)
     assert "003_______etc_passwd.ply" in {f.name for f in files}
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
 
 
-def test_an_export_replaces_an_export_and_nothing_else(scene, tmp_path):
+def test_an_export_replaces_only_a_previous_export(scene, tmp_path):
     export_scene(scene, tmp_path / "out", format="ply")
     export_scene(scene, tmp_path / "out", format="spz")
     assert all(not p.name.endswith(".ply") for p in (tmp_path / "out").iterdir())
@@ -141,13 +141,13 @@ def test_an_export_replaces_an_export_and_nothing_else(scene, tmp_path):
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"background": 1, "objects": [3]}'])
-def test_a_folder_with_an_index_of_somebody_else_is_kept(scene, tmp_path, text):
+def test_a_folder_with_a_foreign_index_is_kept(scene, tmp_path, text):
     (tmp_path / "objects.json").write_text(text)
     with pytest.raises(SceneError, match="holds something else"):
         export_scene(scene, tmp_path, format="ply")
 
 
-def test_a_failing_export_leaves_nothing(scene, tmp_path):
+def test_a_failed_export_leaves_no_files(scene, tmp_path):
     scene.objects["car_3"].cloud.scales[0] = 0
     with pytest.raises(SceneError, match="scales not positive"):
         export_scene(scene, tmp_path / "out", format="ply")
@@ -167,13 +167,13 @@ def test_a_failing_export_leaves_nothing(scene, tmp_path):
         ({"format": "gltf", "up_axis": "z"}, "glTF is always y up"),
     ],
 )
-def test_bad_requests_are_refused(scene, tmp_path, options, reason):
+def test_invalid_export_requests_are_refused(scene, tmp_path, options, reason):
     with pytest.raises((SceneError, UnknownObjectError), match=reason):
         export_scene(scene, tmp_path / "a.ply", **{"format": "ply"} | options)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_ply_does_not_silently_become_a_compressed_one(scene, tmp_path):
+def test_a_suffix_of_another_format_is_refused(scene, tmp_path):
     with pytest.raises(SceneError, match="this ending means PlayCanvas compressed ply, not ply"):
         export_scene(scene, tmp_path / "a.compressed.ply", format="ply", t_us=7)
 

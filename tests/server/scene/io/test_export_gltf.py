@@ -21,7 +21,7 @@ EXTENSION = "KHR_gaussian_splatting"
 
 @pytest.fixture
 def drive(scene, make_cloud) -> Scene:
-    """Three seconds with a car all along, one that comes and goes, and one seen once."""
+    """A 3 s scene with a car present throughout, one present for a while and one for one frame."""
     times = np.arange(0, 3_000_001, 250_000) + 1_700_000_000_000_000
     turn = np.linspace(0.2, 7.0, len(times))
     path = np.stack([np.cos(turn) * 30, np.sin(turn) * 30, turn * 0.1], axis=1)
@@ -46,7 +46,7 @@ def seconds(drive, t_us):
     return (t_us - drive.start_us) / 1e6
 
 
-def test_it_is_a_file_of_the_extension(glb):
+def test_the_file_uses_the_gaussian_splatting_extension(glb):
     assert glb.json["asset"]["version"] == "2.0"
     assert glb.json["extensionsUsed"] == [EXTENSION]
     for mesh in glb.json["meshes"]:
@@ -57,7 +57,7 @@ def test_it_is_a_file_of_the_extension(glb):
         }
 
 
-def test_background_objects_and_ego_hang_below_one_root(glb):
+def test_background_objects_and_ego_share_one_root(glb):
     (root,) = glb.json["scenes"][0]["nodes"]
     children = [glb.json["nodes"][i]["name"] for i in glb.json["nodes"][root]["children"]]
     assert children == ["background", "car_1", "car_2", "van_3", "ego"]
@@ -90,7 +90,7 @@ def test_gaussians_keep_their_values(glb, drive, name):
         np.testing.assert_array_equal(coefficient, cloud.sh[:, k])
 
 
-def test_viewers_without_the_extension_see_the_colour_of_the_first_harmonic(glb, drive):
+def test_fallback_colours_are_those_of_the_constant_harmonic(glb, drive):
     rgba = glb.attributes("car_1")["COLOR_0"] / 255
     cloud = drive.objects["car_1"].cloud
     expected = (0.5 + 0.28209479 * cloud.sh[:, 0].numpy()).clip(0, 1)
@@ -98,13 +98,13 @@ def test_viewers_without_the_extension_see_the_colour_of_the_first_harmonic(glb,
     np.testing.assert_allclose(rgba[:, 3], cloud.opacities, atol=0.501 / 255)
 
 
-def test_positions_state_their_bounds(glb):
+def test_positions_have_bounds(glb):
     for mesh in glb.json["meshes"]:
         index = mesh["primitives"][0]["attributes"]["POSITION"]
         assert "min" in glb.json["accessors"][index]
 
 
-def test_tracks_are_linear_channels_with_a_key_for_every_pose(glb, drive):
+def test_tracks_are_linear_channels_with_one_key_per_pose(glb, drive):
     for name, track in [
         ("car_1", drive.objects["car_1"].trajectory),
         ("car_2", drive.objects["car_2"].trajectory),
@@ -125,7 +125,7 @@ def test_tracks_are_linear_channels_with_a_key_for_every_pose(glb, drive):
 
 
 @pytest.mark.parametrize("name", ["car_1", "car_2", "van_3", "ego"])
-def test_the_animation_gives_the_poses_of_the_trajectory(glb, drive, name):
+def test_the_animation_matches_the_trajectory(glb, drive, name):
     track = drive.ego if name == "ego" else drive.objects[name].trajectory
     random = np.random.default_rng(0)
     asked = random.integers(track.start_us, track.end_us + 1, 40).tolist()
@@ -135,14 +135,14 @@ def test_the_animation_gives_the_poses_of_the_trajectory(glb, drive, name):
         )
 
 
-def test_objects_are_hidden_while_they_do_not_exist(glb, drive):
+def test_objects_are_hidden_outside_their_lifetime(glb, drive):
     for name, scene_object in drive.objects.items():
         track = scene_object.trajectory
         for t_us in range(drive.start_us, drive.end_us + 1, 50_000):
             assert glb.shown(name, seconds(drive, t_us)) == track.covers(t_us), (name, t_us)
 
 
-def test_the_root_turns_z_up_to_y_up(glb, drive):
+def test_the_root_rotates_z_up_to_y_up(glb, drive):
     root = rotation_matrix(np.array(glb.node(drive.name)["rotation"]))
     # glTF: y up, z forward, x left.
     np.testing.assert_allclose(root @ [0, 0, 1], [0, 1, 0], atol=1e-12)
@@ -150,7 +150,7 @@ def test_the_root_turns_z_up_to_y_up(glb, drive):
     np.testing.assert_allclose(root @ [0, 1, 0], [1, 0, 0], atol=1e-12)
 
 
-def test_cameras_see_what_the_rig_sees(glb, drive):
+def test_cameras_match_the_rig(glb, drive):
     camera = drive.rig["front"]
     t_us = int(drive.ego.times_us[4])
     point = np.array([20.0, 3.0, 1.0, 1.0])
@@ -164,7 +164,7 @@ def test_cameras_see_what_the_rig_sees(glb, drive):
     assert np.tan(lens["yfov"] / 2) * lens["aspectRatio"] == pytest.approx(640 / 2 / 700.1)
 
 
-def test_an_instant_stands_still(drive, tmp_path):
+def test_an_export_at_one_time_has_no_animation(drive, tmp_path):
     t_us = int(drive.ego.times_us[3]) + 100_000
     (file,) = export_scene(drive, tmp_path / "a.glb", format="gltf", t_us=t_us)
     still = Glb(file)
@@ -177,13 +177,13 @@ def test_an_instant_stands_still(drive, tmp_path):
         np.testing.assert_allclose(still.local(name, 0), expected, atol=1e-12)
 
 
-def test_only_the_objects_asked_for_are_written(drive, tmp_path):
+def test_only_requested_objects_are_written(drive, tmp_path):
     (file,) = export_scene(drive, tmp_path / "a.glb", format="gltf", objects=["car_2"])
     names = {n["name"] for n in Glb(file).json["nodes"]}
     assert names == {drive.name, "background", "car_2", "ego", "front", "rear"}
 
 
-def test_what_holds_no_gaussians_is_a_node_without_mesh(drive, tmp_path):
+def test_an_empty_cloud_is_a_node_without_a_mesh(drive, tmp_path):
     bare = replace(drive, background=GaussianCloud.empty(), rig=CameraRig(()))
     glb = Glb(export_scene(bare, tmp_path / "a.glb", format="gltf")[0])
     assert "mesh" not in glb.node("background")
@@ -191,7 +191,7 @@ def test_what_holds_no_gaussians_is_a_node_without_mesh(drive, tmp_path):
     assert "cameras" not in glb.json
 
 
-def test_a_scene_of_nothing_still_is_a_file(scene, tmp_path):
+def test_an_empty_scene_gives_a_valid_file(scene, tmp_path):
     still = Trajectory([5], [[0, 0, 0]], [[1, 0, 0, 0]])
     nothing = replace(scene, background=GaussianCloud.empty(), objects={}, ego=still)
     glb = Glb(export_scene(nothing, tmp_path / "a.glb", format="gltf")[0])
@@ -206,13 +206,13 @@ def test_key_times_too_close_for_float32_still_increase(drive, tmp_path):
     assert (np.diff(glb.channels("ego")["translation"][0]) > 0).all()
 
 
-def test_values_that_are_not_finite_are_refused(drive, tmp_path):
+def test_non_finite_values_are_refused(drive, tmp_path):
     drive.objects["car_2"].cloud.means[0, 0] = float("nan")
     with pytest.raises(SceneError, match=r"object 'car_2'.*means not finite"):
         export_scene(drive, tmp_path / "a.glb", format="gltf")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_same_scene_gives_the_same_bytes(drive, tmp_path):
+def test_export_is_reproducible(drive, tmp_path):
     files = [export_scene(drive, tmp_path / f"{i}.glb", format="gltf")[0] for i in range(2)]
     assert files[0].read_bytes() == files[1].read_bytes()

@@ -17,7 +17,7 @@ from real2sim_server.scene.io import (
 )
 
 
-def test_a_bundle_keeps_the_ground_bit_for_bit(scene, bundle):
+def test_the_ground_round_trips_exactly_in_bundles(scene, bundle):
     loaded = load_scene(bundle).stored_ground
     assert loaded is not None
     assert np.array_equal(loaded.heights, scene.ground.heights)
@@ -26,11 +26,11 @@ def test_a_bundle_keeps_the_ground_bit_for_bit(scene, bundle):
     assert loaded.cell == scene.ground.cell
 
 
-def test_saving_says_which_ground_was_stored(scene, tmp_path):
+def test_saving_returns_the_stored_ground(scene, tmp_path):
     assert save_scene(scene, tmp_path / "a.r2s").stored_ground is scene.ground
 
 
-def test_the_ground_counts_for_the_hash(scene, tmp_path):
+def test_the_hash_covers_the_ground(scene, tmp_path):
     plain = save_scene(scene, tmp_path / "a.r2s")
     raised = save_scene(replace(scene, stored_ground=Ground.level(1.0)), tmp_path / "b.r2s")
     assert plain.content_hash != raised.content_hash
@@ -45,7 +45,7 @@ def test_a_summary_reads_the_ground_without_the_scene(scene, bundle):
     assert np.array_equal(read_scene_summary(bundle).ground.heights, scene.ground.heights)
 
 
-def test_a_summary_of_a_bundle_that_was_replaced_says_so(scene, bundle):
+def test_the_summary_of_a_replaced_bundle_raises(scene, bundle):
     summary = read_scene_summary(bundle)
     save_scene(replace(scene, stored_ground=Ground.level(1.0)), bundle, overwrite=True)
     with pytest.raises(BundleError, match="another bundle"):
@@ -61,7 +61,7 @@ def test_a_damaged_ground_is_refused(bundle):
         load_scene(bundle)
 
 
-def test_a_packed_scene_keeps_the_ground_to_half_a_millimetre(scene, tmp_path):
+def test_packed_scenes_keep_the_ground_to_half_a_millimetre(scene, tmp_path):
     write_packed(scene, tmp_path / "a.r2s.zip")
     unpacked = read_packed(tmp_path / "a.r2s.zip").stored_ground
     assert unpacked is not None

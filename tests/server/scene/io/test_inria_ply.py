@@ -14,7 +14,7 @@ BASE = (
 
 
 def write_columns(path: Path, columns: dict[str, np.ndarray]) -> Path:
-    """A ply of exactly these properties, in this order and of these types."""
+    """Write a ply with exactly these properties, in this order and with these types."""
     names = {"f4": "float", "f8": "double", "u1": "uchar", "i4": "int"}
     count = len(next(iter(columns.values())))
     records = np.empty(count, dtype=[(n, v.dtype) for n, v in columns.items()])
@@ -33,7 +33,7 @@ def columns() -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_a_written_cloud_comes_back(make_cloud, tmp_path, degree):
+def test_a_written_cloud_round_trips(make_cloud, tmp_path, degree):
     cloud = make_cloud(31, degree=degree)
     write_splats(cloud, tmp_path / "a.ply")
     back = read_splats(tmp_path / "a.ply")
@@ -53,7 +53,7 @@ def test_opacities_of_zero_and_one_survive(make_cloud, tmp_path):
     assert back[1] == 1
 
 
-def test_an_empty_cloud_comes_back(tmp_path):
+def test_an_empty_cloud_round_trips(tmp_path):
     write_splats(GaussianCloud.empty(sh_degree=2), tmp_path / "a.ply")
     back = read_splats(tmp_path / "a.ply")
     assert (len(back), back.sh_degree) == (0, 2)
@@ -80,7 +80,7 @@ def test_harmonics_are_stored_channel_by_channel(columns, tmp_path, count, degre
         assert cloud.sh[0, 1:, channel].tolist() == [channel * bands + k for k in range(bands)]
 
 
-def test_order_types_and_unknown_properties_do_not_matter(columns, tmp_path):
+def test_property_order_types_and_extras_do_not_matter(columns, tmp_path):
     plain = read_splats(write_columns(tmp_path / "a.ply", columns))
     other = {name: columns[name] for name in reversed(columns)}
     other["y"] = other["y"].astype(np.float64)
@@ -91,7 +91,7 @@ def test_order_types_and_unknown_properties_do_not_matter(columns, tmp_path):
         assert torch.equal(getattr(plain, name), getattr(again, name))
 
 
-def test_bytes_are_taken_as_numbers(columns, tmp_path):
+def test_byte_properties_are_read_as_numbers(columns, tmp_path):
     columns["x"] = np.arange(6, dtype=np.uint8)
     assert read_splats(write_columns(tmp_path / "a.ply", columns)).means[:, 0].tolist() == [
         *(0, 1, 2, 3, 4, 5)
@@ -99,7 +99,7 @@ def test_bytes_are_taken_as_numbers(columns, tmp_path):
 
 
 @pytest.mark.parametrize("name", BASE)
-def test_nan_is_refused_by_property_and_count(columns, tmp_path, name):
+def test_nan_is_refused_with_property_and_count(columns, tmp_path, name):
     columns[name][[2, 4]] = np.nan
     reason = rf"a\.ply: property '{name}' is NaN.* in 2 of 6 splats, the first at 2"
     with pytest.raises(BundleError, match=reason):
@@ -113,13 +113,13 @@ def test_infinity_is_refused(columns, tmp_path, name):
         read_splats(write_columns(tmp_path / "a.ply", columns))
 
 
-def test_infinite_logits_are_opacities_of_zero_and_one(columns, tmp_path):
+def test_infinite_logits_become_opacities_of_zero_and_one(columns, tmp_path):
     columns["opacity"][:2] = [-np.inf, np.inf]
     cloud = read_splats(write_columns(tmp_path / "a.ply", columns))
     assert cloud.opacities[:2].tolist() == [0, 1]
 
 
-def test_rotations_of_length_zero_are_refused(columns, tmp_path):
+def test_zero_length_rotations_are_refused(columns, tmp_path):
     for i in range(4):
         columns[f"rot_{i}"][3] = 0
     with pytest.raises(BundleError, match="1 of 6 rotations have length zero, the first at 3"):
@@ -145,7 +145,7 @@ def test_missing_properties_are_named(columns, tmp_path, name):
 
 
 @pytest.mark.parametrize("indices", [[0], range(8), range(10), range(1, 10), range(48)])
-def test_harmonics_of_no_degree_are_refused(columns, tmp_path, indices):
+def test_incomplete_harmonics_are_refused(columns, tmp_path, indices):
     rest = {f"f_rest_{i}": columns["x"] for i in indices}
     with pytest.raises(BundleError, match="f_rest properties; allowed"):
         read_splats(write_columns(tmp_path / "a.ply", columns | rest))
@@ -158,7 +158,7 @@ def test_a_ply_without_vertices_is_refused(tmp_path):
         read_splats(tmp_path / "a.ply")
 
 
-def test_a_cloud_that_is_not_finite_is_not_written(make_cloud, tmp_path):
+def test_a_non_finite_cloud_is_not_written(make_cloud, tmp_path):
     cloud = make_cloud()
     cloud.means[0, 0] = float("nan")
     with pytest.raises(SceneError, match="not finite"):
@@ -166,7 +166,7 @@ def test_a_cloud_that_is_not_finite_is_not_written(make_cloud, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_failure_while_writing_leaves_the_old_file(make_cloud, tmp_path, monkeypatch):
+def test_a_failed_write_keeps_the_old_file(make_cloud, tmp_path, monkeypatch):
     file = tmp_path / "a.ply"
     write_splats(make_cloud(3), file)
     before = file.read_bytes()

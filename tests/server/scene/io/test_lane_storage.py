@@ -1,4 +1,4 @@
-"""Lanes in scene bundles and documents: bit for bit back, damage refused."""
+"""Lanes in scene bundles and documents: exact round trips and damage."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def same(a, b):
     return a == b
 
 
-def test_lanes_come_back_from_a_bundle_bit_for_bit(tiny_scene, tmp_path):
+def test_lanes_round_trip_exactly_in_bundles(tiny_scene, tmp_path):
     saved = save_scene(replace(tiny_scene, lanes=graph()), tmp_path / "a.r2s")
     assert same(load_scene(tmp_path / "a.r2s").lanes, graph())
     summary = read_scene_summary(tmp_path / "a.r2s")
@@ -70,7 +70,7 @@ def test_a_scene_without_lanes_is_written_without_them(tiny_scene, tmp_path):
     assert read_scene_summary(tmp_path / "a.r2s").lanes is None
 
 
-def test_lanes_come_back_from_their_document(tmp_path):
+def test_lanes_round_trip_in_documents(tmp_path):
     document = lane_document(graph())
     assert same(graph_of(document), graph())
     (tmp_path / "lanes.json").write_text(document.model_dump_json())
@@ -78,7 +78,7 @@ def test_lanes_come_back_from_their_document(tmp_path):
 
 
 @pytest.mark.parametrize("change", [{"points": 8}, {"centre": -1}, {"lane_id": "b"}])
-def test_lanes_that_do_not_fit_their_file_are_refused(tiny_scene, tmp_path, change):
+def test_inconsistent_lanes_are_refused(tiny_scene, tmp_path, change):
     save_scene(replace(tiny_scene, lanes=graph()), tmp_path / "a.r2s")
     path = tmp_path / "a.r2s" / "scene.json"
     document = json.loads(path.read_text())
@@ -89,7 +89,7 @@ def test_lanes_that_do_not_fit_their_file_are_refused(tiny_scene, tmp_path, chan
         load_scene(tmp_path / "a.r2s", verify=False)
 
 
-def test_a_file_that_is_no_document_of_lanes_is_refused_by_name(tmp_path):
+def test_a_file_that_is_not_a_lane_document_is_refused(tmp_path):
     (tmp_path / "lanes.json").write_text('{"lanes": [{"lane_id": "a"}]}')
     with pytest.raises(BundleError, match=r"lanes\.json.*kind"):
         read_lanes(tmp_path / "lanes.json")

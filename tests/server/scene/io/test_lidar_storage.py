@@ -1,4 +1,4 @@
-"""What LiDARs see, in bundles."""
+"""LiDAR surfaces in bundles."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def surfaces(make_cloud):
     return LidarSurfaces(reflector(7), {"car_3": reflector(3)})
 
 
-def test_surfaces_come_back_as_they_were(scene, surfaces, tmp_path):
+def test_surfaces_round_trip(scene, surfaces, tmp_path):
     save_scene(replace(scene, lidar=surfaces), tmp_path / "a.r2s")
     read = load_scene(tmp_path / "a.r2s").lidar
     assert read is not None
@@ -43,7 +43,7 @@ def test_surfaces_come_back_as_they_were(scene, surfaces, tmp_path):
             assert torch.equal(getattr(written.cloud, name), getattr(back.cloud, name))
 
 
-def test_incidence_and_the_response_of_rings_come_back(scene, surfaces, tmp_path):
+def test_incidence_and_ring_response_round_trip(scene, surfaces, tmp_path):
     steps = len(RANGE_STEPS) - 1
     gain = np.linspace(0.5, 1.5, 2 * steps, dtype=np.float32).reshape(2, steps)
     response = RingResponse(np.array([0.1, -0.2], np.float32), gain, gain - 1)
@@ -64,7 +64,7 @@ def test_a_scene_without_surfaces_is_written_without_them(scene, tmp_path):
     assert load_scene(tmp_path / "a.r2s").lidar is None
 
 
-def test_changed_attributes_are_noticed(scene, surfaces, tmp_path):
+def test_changed_attributes_are_detected(scene, surfaces, tmp_path):
     save_scene(replace(scene, lidar=surfaces), tmp_path / "a.r2s")
     file = tmp_path / "a.r2s" / "lidar.safetensors"
     data = bytearray(file.read_bytes())
@@ -74,7 +74,7 @@ def test_changed_attributes_are_noticed(scene, surfaces, tmp_path):
         load_scene(tmp_path / "a.r2s")
 
 
-def test_attributes_of_another_number_are_refused(make_cloud):
+def test_attributes_with_a_wrong_count_are_refused(make_cloud):
     with pytest.raises(SceneError, match=r"must be \(4, 2\) float32"):
         Reflector(make_cloud(4), torch.zeros(3, 2))
 

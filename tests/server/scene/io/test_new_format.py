@@ -1,8 +1,8 @@
-"""A splat format from outside of the package: the CSV of PlayCanvas' splat-transform.
+"""A splat format from outside the package: the CSV of PlayCanvas' splat-transform.
 
-A header line names the columns, those of a trained PLY: log scales, logit opacities, rotation wxyz
-and spherical harmonics channel by channel. One module, one call of ``register_format``, and the
-format is read, written, imported and exported like the others.
+A header line names the columns of a trained PLY: log scales, logit opacities, rotation wxyz and
+spherical harmonics channel by channel. After one call of ``register_format`` the format can be
+read, written, imported and exported like the others.
 """
 
 from pathlib import Path
@@ -24,7 +24,7 @@ COLUMNS += [f"{name}_{k}" for name, n in (("scale", 3), ("rot", 4), ("f_dc", 3))
 
 
 class SplatCsv:
-    """Constant colours only; numbers as the shortest text that reads back exactly."""
+    """CSV with constant colours. Numbers are the shortest text that round-trips."""
 
     name = "splat-transform CSV"
     suffix = ".csv"
@@ -66,7 +66,7 @@ class SplatCsv:
 
 @pytest.fixture
 def csv():
-    """The format, registered for one test."""
+    """Register the format for one test."""
     before = FORMATS[:]
     splat_csv = SplatCsv()
     register_format(splat_csv)
@@ -74,16 +74,16 @@ def csv():
     FORMATS[:] = before
 
 
-def test_it_keeps_the_contract(csv, make_cloud, tmp_path):
+def test_the_format_fulfils_the_contract(csv, make_cloud, tmp_path):
     check_contract(csv, make_cloud, tmp_path)
 
 
-def test_scenes_are_exported_to_it_and_imported_from_it(csv, scene, tmp_path):
+def test_scenes_are_exported_and_imported(csv, scene, tmp_path):
     (file,) = export_scene(scene, tmp_path / "a.csv", format="csv", t_us=scene.start_us)
     imported = import_splats(file, name="again")
     assert len(imported.background) == scene.gaussian_count
 
 
-def test_a_name_or_suffix_that_is_taken_is_refused(csv):
+def test_a_registered_name_or_suffix_is_refused(csv):
     with pytest.raises(ValueError, match=r"INRIA ply \(\.ply\) is registered already"):
         register_format(InriaPly())

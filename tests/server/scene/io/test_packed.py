@@ -1,4 +1,4 @@
-"""Packed scenes: how near they come back, and what is refused."""
+"""Packed scenes: accuracy of round trips, and refused files."""
 
 import contextlib
 import io
@@ -23,7 +23,7 @@ def packed(scene, tmp_path):
 
 
 def matched(before, after):
-    """Gaussians of ``after`` in the order of ``before``, by their centres."""
+    """Gaussians of ``after`` in the order of ``before``, matched by their centres."""
     _, index = cKDTree(after.means.numpy()).query(before.means.numpy())
     assert len(set(index.tolist())) == len(index)
     return after.select(torch.from_numpy(index))
@@ -33,7 +33,7 @@ def same_rotation(a, b):
     return (torch.nn.functional.normalize(a, dim=1) * b).sum(1).abs()
 
 
-def test_gaussians_come_back_to_quantisation(scene, packed):
+def test_gaussians_round_trip_within_quantisation(scene, packed):
     read = read_packed(packed)
     pairs = [(scene.background, read.background)]
     pairs += [(scene.objects[key].cloud, read.objects[key].cloud) for key in scene.objects]
@@ -50,7 +50,7 @@ def test_gaussians_come_back_to_quantisation(scene, packed):
         ].abs().max() / 127
 
 
-def test_everything_else_comes_back_exactly(scene, packed):
+def test_other_parts_round_trip_exactly(scene, packed):
     read = read_packed(packed)
     assert read.name == scene.name
     assert read.provenance == scene.provenance
@@ -63,9 +63,9 @@ def test_everything_else_comes_back_exactly(scene, packed):
         assert (read.objects[key].trajectory.positions == item.trajectory.positions).all()
 
 
-def test_colours_over_time_stay_with_their_gaussians(scene, tmp_path):
+def test_time_varying_colours_stay_with_their_gaussians(scene, tmp_path):
     key, item = next(iter(scene.objects.items()))
-    # Each Gaussian's coefficient is its own x coordinate, which shows whose it is afterwards.
+    # The coefficient of each Gaussian is its x coordinate, which identifies it after reading.
     own = item.cloud.means[:, :1, None].expand(-1, 1, 3).contiguous()
     coloured = replace(item, colour=TimeColour(own, "cosine", 0, 1_000_000))
     write_packed(replace(scene, objects={**scene.objects, key: coloured}), tmp_path / "a.r2s.zip")
@@ -74,12 +74,12 @@ def test_colours_over_time_stay_with_their_gaussians(scene, tmp_path):
     assert error.max() < 4e-3 * item.cloud.means.abs().max()
 
 
-def test_the_same_scene_gives_the_same_bytes(scene, packed, tmp_path):
+def test_packing_is_reproducible(scene, packed, tmp_path):
     write_packed(scene, tmp_path / "again.r2s.zip")
     assert packed.read_bytes() == (tmp_path / "again.r2s.zip").read_bytes()
 
 
-def test_what_is_missing_or_cut_short_is_refused_by_name(packed, tmp_path):
+def test_missing_and_truncated_files_are_refused_by_name(packed, tmp_path):
     with pytest.raises(BundleError, match="nowhere"):
         read_packed(tmp_path / "nowhere.r2s.zip")
     short = tmp_path / "short.r2s.zip"
@@ -118,7 +118,7 @@ def test_a_missing_array_is_refused(packed, tmp_path):
         read_packed(other)
 
 
-def test_damage_anywhere_in_the_file_is_told_by_name(packed, tmp_path):
+def test_bit_flips_raise_only_bundle_errors(packed, tmp_path):
     whole = packed.read_bytes()
     path = tmp_path / "damaged.r2s.zip"
     generator = np.random.default_rng(3)
@@ -131,7 +131,7 @@ def test_damage_anywhere_in_the_file_is_told_by_name(packed, tmp_path):
             read_packed(path)
 
 
-def test_an_array_that_promises_more_than_there_is_is_refused(packed, tmp_path):
+def test_an_array_larger_than_the_file_is_refused(packed, tmp_path):
     other = tmp_path / "other.r2s.zip"
     with zipfile.ZipFile(packed) as source, zipfile.ZipFile(other, "w") as target:
         for name in source.namelist():
@@ -146,7 +146,7 @@ def test_an_array_that_promises_more_than_there_is_is_refused(packed, tmp_path):
         read_packed(other)
 
 
-def test_packing_saves_two_thirds(make_cloud, scene, tmp_path):
+def test_packing_saves_60_percent(make_cloud, scene, tmp_path):
     big = replace(scene, background=make_cloud(20_000, degree=1))
     write_packed(big, tmp_path / "big.r2s.zip")
     raw = sum(np.prod(t.shape) * 4 for t in big.background.tensors().values())

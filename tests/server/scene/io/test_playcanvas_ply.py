@@ -16,7 +16,7 @@ PACKED = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
 def write_compressed(
     path: Path, chunks: np.ndarray, words: np.ndarray, sh: np.ndarray | None = None
 ) -> Path:
-    """chunks [C, 12 or 18] float32, words [N, 4] uint32, sh [N, 9, 24 or 45] uint8."""
+    """Write chunks [C, 12 or 18] float32, words [N, 4] uint32, sh [N, 9, 24 or 45] uint8."""
     lines = ["ply", "format binary_little_endian 1.0", "comment a test"]
     lines.append(f"element chunk {len(chunks)}")
     names = (POSITIONS + SCALES + COLOURS)[: chunks.shape[1]]
@@ -52,7 +52,7 @@ def chunks() -> np.ndarray:
 
 @pytest.fixture
 def words() -> np.ndarray:
-    """Random words whose three small quaternion parts fit together, 600 splats of 3 chunks."""
+    """Random words of 600 splats in 3 chunks, with valid quaternions."""
     random = np.random.default_rng(2)
     words = random.integers(0, 2**32, size=(600, 4), dtype=np.uint64)
     small = random.integers(312, 712, size=(600, 3), dtype=np.uint64)
@@ -65,7 +65,7 @@ def lerp(low: float, high: float, fraction: float) -> float:
 
 
 def decode(chunk: np.ndarray, word: np.ndarray) -> dict[str, list[float]]:
-    """One splat after the format's description, number by number."""
+    """Decode one splat from the specification, in plain Python."""
     position, rotation, scale, colour = (int(w) for w in word)
     fractions = [
         [(w >> 21) / 2047, (w >> 11 & 1023) / 1023, (w & 2047) / 2047] for w in (position, scale)
@@ -86,7 +86,7 @@ def decode(chunk: np.ndarray, word: np.ndarray) -> dict[str, list[float]]:
 
 
 @pytest.mark.parametrize("width", [12, 18])
-def test_splats_are_decoded_as_described(chunks, words, tmp_path, width):
+def test_splats_are_decoded_as_specified(chunks, words, tmp_path, width):
     chunks = chunks[:, :width]
     cloud = read_splats(write_compressed(tmp_path / "a.ply", chunks, words))
     assert (len(cloud), cloud.sh_degree) == (600, 0)
@@ -98,14 +98,14 @@ def test_splats_are_decoded_as_described(chunks, words, tmp_path, width):
 
 
 @pytest.mark.parametrize("largest", range(4))
-def test_the_largest_quaternion_part_goes_to_its_place(chunks, words, tmp_path, largest):
+def test_the_largest_quaternion_part_is_placed_by_its_index(chunks, words, tmp_path, largest):
     # 0.5 is not among the 1024 levels: the small parts are half a level off zero.
     words[:, 1] = largest << 30 | 512 << 20 | 512 << 10 | 511
     quats = read_splats(write_compressed(tmp_path / "a.ply", chunks, words)).quats[0]
     np.testing.assert_allclose(quats.abs().numpy(), np.eye(4)[largest], atol=1e-3)
 
 
-def test_the_ends_of_the_range_are_the_chunk_bounds(chunks, words, tmp_path):
+def test_the_extreme_codes_are_the_chunk_bounds(chunks, words, tmp_path):
     words[0, 0], words[1, 0] = 0, 0xFFFFFFFF
     means = read_splats(write_compressed(tmp_path / "a.ply", chunks, words)).means
     np.testing.assert_array_equal(means[0], chunks[0, :3])
@@ -113,7 +113,7 @@ def test_the_ends_of_the_range_are_the_chunk_bounds(chunks, words, tmp_path):
 
 
 @pytest.mark.parametrize(("count", "degree"), [(9, 1), (24, 2), (45, 3)])
-def test_harmonics_are_bytes_over_minus_four_to_four(chunks, words, tmp_path, count, degree):
+def test_harmonics_are_bytes_from_minus_four_to_four(chunks, words, tmp_path, count, degree):
     codes = np.random.default_rng(3).integers(0, 256, size=(600, count))
     codes[0, :3] = [0, 255, 128]
     cloud = read_splats(write_compressed(tmp_path / "a.ply", chunks, words, codes))
@@ -125,20 +125,20 @@ def test_harmonics_are_bytes_over_minus_four_to_four(chunks, words, tmp_path, co
         np.testing.assert_allclose(cloud.sh[7, 1:, channel], middle, atol=0.016)
 
 
-def test_small_parts_that_exceed_unit_length_still_give_a_rotation(chunks, words, tmp_path):
+def test_small_parts_beyond_unit_length_give_a_valid_rotation(chunks, words, tmp_path):
     words[:, 1] = 0xFFFFFFFF
     read_splats(write_compressed(tmp_path / "a.ply", chunks, words)).check_values("cloud")
 
 
 @pytest.mark.parametrize("count", [2, 4, 0])
-def test_chunks_that_do_not_fit_the_splats_are_refused(chunks, words, tmp_path, count):
+def test_a_wrong_number_of_chunks_is_refused(chunks, words, tmp_path, count):
     chunks = np.resize(chunks, (count, 18))
     with pytest.raises(BundleError, match=rf"a\.ply: {count} chunks of 256 do not fit 600 splats"):
         read_splats(write_compressed(tmp_path / "a.ply", chunks, words))
 
 
 @pytest.mark.parametrize(("rows", "width"), [(599, 9), (600, 8), (600, 12), (600, 48), (0, 9)])
-def test_harmonics_that_do_not_fit_are_refused(chunks, words, tmp_path, rows, width):
+def test_harmonics_with_a_wrong_shape_are_refused(chunks, words, tmp_path, rows, width):
     with pytest.raises(BundleError, match="element 'sh' has"):
         read_splats(write_compressed(tmp_path / "a.ply", chunks, words, np.zeros((rows, width))))
 

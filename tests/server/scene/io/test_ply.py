@@ -52,13 +52,13 @@ def test_big_endian_is_read(ply):
         ("end_header", "element camera 0\nend_header"),
     ],
 )
-def test_what_writers_add_is_tolerated(ply, old, new):
+def test_comments_and_empty_elements_are_tolerated(ply, old, new):
     np.testing.assert_array_equal(
         read_ply_elements(ply(HEADER.replace(old, new)))["vertex"], RECORDS
     )
 
 
-def test_elements_follow_each_other(ply):
+def test_several_elements_are_read(ply):
     header = HEADER.replace("end_header", "element more 2\nproperty short s\nend_header")
     elements = read_ply_elements(ply(header, RECORDS.tobytes() + np.int16([-5, 9]).tobytes()))
     np.testing.assert_array_equal(elements["vertex"], RECORDS)
@@ -95,12 +95,12 @@ def test_an_element_without_records_is_empty(ply):
         (HEADER.replace("end_header", "surprise\nend_header"), "surprise"),
     ],
 )
-def test_bad_headers_are_refused_by_file_and_reason(ply, header, reason):
+def test_bad_headers_are_refused_with_file_and_reason(ply, header, reason):
     with pytest.raises(BundleError, match=rf"file\.ply: .*{reason}"):
         read_ply_elements(ply(header))
 
 
-def test_a_header_without_end_is_not_read_for_ever(ply):
+def test_an_endless_header_is_refused(ply):
     with pytest.raises(BundleError, match="no end_header"):
         read_ply_header(ply("ply\n" + "comment x\n" * (MAX_HEADER_BYTES // 8)))
 
@@ -113,25 +113,25 @@ def test_a_truncated_file_is_refused_with_both_sizes(ply, cut):
         read_ply_elements(ply(data=data))
 
 
-def test_a_file_longer_than_its_header_says_is_refused(ply):
+def test_trailing_data_is_refused(ply):
     with pytest.raises(BundleError, match="longer than its header says"):
         read_ply_elements(ply(data=RECORDS.tobytes() + b"\0"))
 
 
-def test_an_absurd_count_is_refused_before_anything_is_allocated(ply):
+def test_an_absurd_count_is_refused_as_truncated(ply):
     with pytest.raises(BundleError, match="truncated"):
         read_ply_elements(ply(HEADER.replace("vertex 3", "vertex 999999999999999")))
 
 
 @pytest.mark.parametrize("kind", ["property float p{}", "element e{} 0"])
-def test_a_header_that_declares_thousands_is_refused_at_once(ply, kind):
+def test_a_header_with_too_many_lines_is_refused(ply, kind):
     lines = "\n".join(kind.format(i) for i in range(20_000))
     start = "ply\nformat binary_little_endian 1.0\nelement vertex 1\n"
     with pytest.raises(BundleError, match=f"more than {MAX_HEADER_LINES} elements and properties"):
         read_ply_header(ply(f"{start}{lines}\nend_header\n", b""))
 
 
-def test_as_many_properties_as_are_allowed_are_read(ply):
+def test_the_maximum_number_of_properties_is_read(ply):
     names = [f"p{i}" for i in range(MAX_HEADER_LINES - 2)]
     lines = "\n".join(f"property uchar {name}" for name in names)
     start = "ply\nformat binary_little_endian 1.0\nelement vertex 1\n"
@@ -139,7 +139,7 @@ def test_as_many_properties_as_are_allowed_are_read(ply):
     assert list(found.elements["vertex"].properties) == names
 
 
-def test_a_message_does_not_repeat_a_long_line(ply):
+def test_messages_truncate_long_lines(ply):
     with pytest.raises(BundleError) as caught:
         read_ply_header(
             ply("ply\nformat binary_little_endian 1.0\n" + "x" * 100_000 + "\nend_header\n")

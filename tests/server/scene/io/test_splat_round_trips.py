@@ -1,4 +1,4 @@
-"""What every format gives back of what it was given, within what its class says it rounds."""
+"""Round trips of every splat format within its documented rounding."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def log_scales(cloud):
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
-def test_values_are_checked_before_anything_is_written(make_cloud, tmp_path, suffix):
+def test_invalid_values_are_not_written(make_cloud, tmp_path, suffix):
     cloud = make_cloud(3)
     cloud.means[1, 2] = float("nan")
     with pytest.raises(SceneError, match="means not finite"):
@@ -40,7 +40,7 @@ def test_values_are_checked_before_anything_is_written(make_cloud, tmp_path, suf
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_name_of_no_format_is_refused_with_the_endings_there_are(make_cloud, tmp_path):
+def test_an_unknown_suffix_is_refused_with_the_known_ones(make_cloud, tmp_path):
     with pytest.raises(SceneError, match=r"a\.obj: no splat format ends so; .*\.spz"):
         write_splats(make_cloud(1), tmp_path / "a.obj")
 
@@ -74,7 +74,7 @@ def test_splat_rounds_as_documented(tmp_path, recipe):
     np.testing.assert_allclose(back.scales, cloud.scales, rtol=1e-6)
     assert_near(back.opacities, cloud.opacities, 0.5 / 255 + 1e-6)
     assert_near(dc_colours(back), dc_colours(cloud).clip(0, 1), 0.5 / 255 + 1e-6)
-    # A part of 1 is cut to 127/128, which turning back to unit length mostly undoes.
+    # A part of 1 is clipped to 127/128. Normalization mostly compensates for it.
     assert rotation_angles(back, cloud).max(initial=0) < np.radians(1.2)
 
 
@@ -91,14 +91,14 @@ def test_compressed_ply_rounds_as_documented(tmp_path, recipe):
     assert_within_chunks(log_scales(back), log_scales(cloud), steps)
     assert_within_chunks(dc_colours(back), dc_colours(cloud), np.array([255, 255, 255]))
     assert_near(back.opacities, cloud.opacities, 0.5 / 255 + 1e-6)
-    # Middles of 1/32 wide bins come back, and the ends where it clamped: a whole bin off at most.
+    # Bins are 1/32 wide. Clamped ends are off by at most a whole bin.
     assert_near(back.sh[:, 1:], cloud.sh[:, 1:].clamp(-4, 4), 1 / 32 + 1e-5)
     assert rotation_angles(back, cloud).max(initial=0) < largest_turn(np.sqrt(2) / 1023)
 
 
 @repeated
 @given(recipe=recipes())
-def test_inria_ply_gives_back_the_same_gaussians(tmp_path, recipe):
+def test_inria_ply_round_trips(tmp_path, recipe):
     cloud = recipe.cloud()
     write_splats(cloud, tmp_path / "a.ply")
     back = read_splats(tmp_path / "a.ply")
@@ -124,19 +124,19 @@ def test_spz_keeps_far_positions_with_a_coarser_step(make_cloud, tmp_path, reach
     assert_near(read_splats(tmp_path / "a.spz").means, cloud.means, step / 2 + 1e-5 * step + 1e-4)
 
 
-def test_spz_refuses_what_24_bits_cannot_hold(make_cloud, tmp_path):
+def test_spz_refuses_positions_beyond_24_bits(make_cloud, tmp_path):
     cloud = make_cloud(2)
     cloud.means[0, 0] = 9e6
     with pytest.raises(SceneError, match="does not fit into an spz file; recentre"):
         write_splats(cloud, tmp_path / "a.spz")
 
 
-def test_spz_writes_no_version_but_3_and_4():
+def test_spz_writes_only_versions_3_and_4():
     with pytest.raises(SceneError, match="must be 3 or 4, not 2"):
         Spz(version=2)
 
 
-def test_splat_puts_what_is_seen_most_first(make_cloud, tmp_path):
+def test_splat_files_are_sorted_by_importance(make_cloud, tmp_path):
     cloud = make_cloud(50)
     write_splats(cloud, tmp_path / "a.splat")
     back = read_splats(tmp_path / "a.splat")
@@ -153,12 +153,12 @@ def test_z_order_keeps_neighbours_together():
         np.median(np.ptp(p.reshape(32, 256, 3), axis=1).prod(axis=1))
         for p in (sorted_points, points)
     )
-    # A 32nd of the whole where a chunk starts at the edge of a cell, some times as much elsewhere.
+    # An aligned chunk takes 1/32 of the volume; others take several times as much.
     assert volume < 0.1 * as_given
     assert sorted(map(tuple, sorted_points)) == sorted(map(tuple, points))
 
 
-def test_z_order_of_one_octant_after_the_other():
+def test_z_order_sorts_corners_by_octant():
     corners = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], dtype=float)
     shuffled = np.random.default_rng(1).permutation(8)
     np.testing.assert_array_equal(corners[shuffled][morton_order(corners[shuffled])], corners)
@@ -179,12 +179,12 @@ def real(test_data, name):
     [
         ("minimal-raw.spz", [1, 1, 1]),
         ("minimal-v2.spz", [1, 1, 1]),
-        # Turned from y down to y up by the writer, as the format asks.
+        # The writer rotates y down to y up, as the format requires.
         ("minimal-v3.spz", [1, -1, -1]),
         ("minimal-v4.spz", [1, -1, -1]),
     ],
 )
-def test_the_same_four_splats_in_every_sample(test_data, name, turn):
+def test_all_samples_hold_the_same_four_splats(test_data, name, turn):
     splat, spz = real(test_data, "minimal.splat"), real(test_data, name)
     assert (len(spz), spz.sh_degree) == (4, 0)
     assert torch.equal(spz.means * torch.tensor(turn), splat.means)
@@ -195,17 +195,17 @@ def test_the_same_four_splats_in_every_sample(test_data, name, turn):
     )
 
 
-def test_colours_of_the_samples(test_data):
+def test_samples_have_the_same_colours(test_data):
     splat, v3 = dc_colours(real(test_data, "minimal.splat")), real(test_data, "minimal-v3.spz")
     step = SH_C0 / 38.25
     assert_near(dc_colours(v3), splat, 0.5 * step + 0.5 / 255)
     for name in ("minimal-raw.spz", "minimal-v2.spz"):
-        # Its writer put the bytes of the .splat into the wider range of spz.
+        # The writer copied the .splat bytes into the wider range of spz.
         stretched = 0.5 + (splat - 0.5) * SH_C0 / 0.15
         assert_near(dc_colours(real(test_data, name)), stretched, step)
 
 
-def test_versions_of_the_samples_agree_bit_for_bit(test_data):
+def test_sample_versions_agree_exactly(test_data):
     for one, other in [("raw", "v2"), ("v3", "v4")]:
         a, b = (real(test_data, f"minimal-{v}.spz") for v in (one, other))
         for field in ("means", "quats", "scales", "opacities", "sh"):
@@ -213,7 +213,7 @@ def test_versions_of_the_samples_agree_bit_for_bit(test_data):
 
 
 @pytest.mark.parametrize("version", [3, 4])
-def test_a_real_cloud_through_spz_differs_by_rounding_only(test_data, tmp_path, version):
+def test_spz_changes_a_real_cloud_only_by_rounding(test_data, tmp_path, version):
     cloud = real(test_data, "biker.compressed.ply")
     Spz(version=version).write(cloud, tmp_path / "biker.spz")
     back = read_splats(tmp_path / "biker.spz")
@@ -224,7 +224,7 @@ def test_a_real_cloud_through_spz_differs_by_rounding_only(test_data, tmp_path, 
     assert rotation_angles(back, cloud).max() < largest_turn(np.sqrt(0.5) / 511)
 
 
-def test_a_real_cloud_compressed_twice_stays_as_it_was(test_data, tmp_path):
+def test_compressed_ply_keeps_positions_of_a_real_cloud(test_data, tmp_path):
     cloud = real(test_data, "donut.ply")
     write_splats(cloud, tmp_path / "once.compressed.ply")
     once = read_splats(tmp_path / "once.compressed.ply")
@@ -235,7 +235,7 @@ def test_a_real_cloud_compressed_twice_stays_as_it_was(test_data, tmp_path):
 
 
 def match(wanted: torch.Tensor, given: torch.Tensor) -> torch.Tensor:
-    """Indices into ``wanted`` that give ``given``; rows must differ."""
+    """Indices into ``wanted`` that reproduce ``given``."""
     left = {tuple(row): [] for row in wanted.tolist()}
     for index, row in enumerate(wanted.tolist()):
         left[tuple(row)].append(index)
@@ -248,7 +248,7 @@ def assert_near(given, expected, tolerance):
 
 
 def assert_within_chunks(given: np.ndarray, expected: np.ndarray, steps: np.ndarray) -> None:
-    """Off by half a step of the chunk's extent at most."""
+    """Assert errors of at most half a step of the chunk's extent."""
     for start in range(0, len(expected), 256):
         part = slice(start, start + 256)
         allowed = np.ptp(expected[part], axis=0) / steps / 2
@@ -256,7 +256,7 @@ def assert_within_chunks(given: np.ndarray, expected: np.ndarray, steps: np.ndar
         assert (np.abs(given[part] - expected[part]) <= allowed + room).all()
 
 
-def test_the_empty_cloud_survives_every_format(tmp_path):
+def test_an_empty_cloud_round_trips_in_every_format(tmp_path):
     for suffix in SUFFIXES:
         write_splats(GaussianCloud.empty(), tmp_path / f"a{suffix}")
         assert len(read_splats(tmp_path / f"a{suffix}")) == 0

@@ -24,19 +24,19 @@ def ply(make_cloud, tmp_path):
 
 
 @pytest.mark.parametrize("data", [b"", b"\x1f\x8b\x08", b"solid", b"\0" * 200_000])
-def test_a_file_of_no_known_format_is_refused_with_those_there_are(tmp_path, data):
+def test_an_unknown_format_is_refused_with_the_known_ones(tmp_path, data):
     (tmp_path / "x.bin").write_bytes(data)
     with pytest.raises(BundleError, match=r"x\.bin: not a ply .*PlayCanvas compressed ply, INRIA"):
         read_splats(tmp_path / "x.bin")
 
 
 @pytest.mark.parametrize("name", ["missing.ply", "."])
-def test_what_cannot_be_opened_is_refused(tmp_path, name):
+def test_unreadable_files_are_refused(tmp_path, name):
     with pytest.raises(BundleError, match="cannot be read"):
         read_splats(tmp_path / name)
 
 
-def test_a_scene_of_a_file_is_ready_to_be_seen(ply, tmp_path):
+def test_a_splat_file_is_imported_as_a_scene(ply, tmp_path):
     scene = import_splats(ply, name="thing")
     assert isinstance(scene, Scene)
     assert (scene.name, len(scene.background), len(scene.objects)) == ("thing", 400, 0)
@@ -46,7 +46,7 @@ def test_a_scene_of_a_file_is_ready_to_be_seen(ply, tmp_path):
     assert len(load_scene(tmp_path / "thing.r2s").background) == 400
 
 
-def test_its_camera_holds_the_box_and_looks_at_its_centre(ply):
+def test_the_camera_frames_the_imported_scene(ply):
     scene = import_splats(ply, name="thing")
     camera = scene.rig["front"]
     low, high = np.percentile(
@@ -83,7 +83,7 @@ def test_an_asset_is_centred_on_its_box(ply, tmp_path):
     assert load_asset(tmp_path / "chair.r2s").size == asset.size
 
 
-def test_the_box_of_an_asset_is_not_stretched_by_floaters(make_cloud, tmp_path):
+def test_floaters_do_not_enlarge_the_box_of_an_asset(make_cloud, tmp_path):
     cloud = make_cloud(1000)
     cloud.opacities[:] = 0.9
     cloud.means[:] = torch.rand(1000, 3, generator=torch.Generator().manual_seed(0))
@@ -108,7 +108,7 @@ def test_up_and_forward_of_the_file_become_z_and_x(make_cloud, tmp_path, up_axis
     torch.testing.assert_close(means, torch.tensor([[0.0, 0, 1], [1, 0, 0]]))
 
 
-def test_yaw_and_scale_follow(make_cloud, tmp_path):
+def test_yaw_and_scale_are_applied(make_cloud, tmp_path):
     cloud = make_cloud(1)
     cloud.means[:] = torch.tensor([1.0, 0, 0.5])
     write_splats(cloud, tmp_path / "a.ply")
@@ -125,7 +125,7 @@ def test_bad_options_are_refused(ply, options):
         import_splats(ply, name="a", **options)
 
 
-def test_a_file_without_splats_is_not_imported(tmp_path):
+def test_a_file_without_splats_is_refused(tmp_path):
     write_splats(GaussianCloud.empty(), tmp_path / "a.ply")
     with pytest.raises(BundleError, match="holds no splats"):
         import_splats(tmp_path / "a.ply", name="a")
@@ -141,11 +141,11 @@ def real(test_data, name):
     return file
 
 
-def test_a_real_compressed_ply_has_sensible_values(test_data):
+def test_a_real_compressed_ply_has_plausible_values(test_data):
     cloud = read_splats(real(test_data, "biker.compressed.ply"))
     cloud.check_values("biker")
     assert (len(cloud), cloud.sh_degree) == (152_746, 0)
-    # A motorcyclist, y down, feet at 0: about three metres high in the file's units.
+    # A motorcyclist, y down, feet at 0, about 3 units high.
     assert cloud.means[:, 1].min() == pytest.approx(-3.18, abs=0.01)
     assert cloud.means[:, 1].max() == pytest.approx(0, abs=0.01)
     assert 1e-3 < cloud.scales.median() < 1e-2
@@ -154,7 +154,7 @@ def test_a_real_compressed_ply_has_sensible_values(test_data):
     assert colour.max() <= 1 + 1e-5
 
 
-def test_a_real_inria_ply_has_sensible_values(test_data):
+def test_a_real_inria_ply_has_plausible_values(test_data):
     cloud = read_splats(real(test_data, "donut.ply"))
     cloud.check_values("donut")
     assert (len(cloud), cloud.sh_degree) == (45_624, 0)
@@ -164,14 +164,14 @@ def test_a_real_inria_ply_has_sensible_values(test_data):
     assert 5e-4 < cloud.scales.median() < 1e-3
 
 
-def test_a_real_ring_is_a_ring(test_data):
+def test_a_real_torus_has_a_hole(test_data):
     asset = import_splats(real(test_data, "donut.ply"), name="donut", as_asset=True)
     radius = asset.cloud.means[:, :2].norm(dim=1)
-    # A torus as wide as 0.2: hardly anything at its axis, most at half its radius and more.
+    # A torus 0.2 wide: almost empty near the axis.
     assert (radius < 0.01).float().mean() < 0.02
     assert (radius > 0.04).float().mean() > 0.8
 
 
-def test_a_plain_point_cloud_is_refused_with_what_it_lacks(test_data):
+def test_a_plain_point_cloud_is_refused_with_missing_properties(test_data):
     with pytest.raises(BundleError, match=r"lacks the properties \['f_dc_0'.*point cloud"):
         read_splats(real(test_data, "car_benz_points.ply"))

@@ -1,4 +1,4 @@
-"""Reading ``.spz`` against its description, number by number, and against damage."""
+"""Reading ``.spz``: decoding against the specification, and damaged files."""
 
 import gzip
 import math
@@ -26,7 +26,7 @@ def rng():
 
 
 def random_parts(rng, *, version, degree):
-    """Streams of 40 random splats; small quaternion parts fit together."""
+    """Streams of 40 random splats with valid quaternions."""
     rotations = rng.integers(90, 166, size=(COUNT, 3)).astype(np.uint8)
     if version >= 3:
         place = rng.integers(0, 4, COUNT).astype(np.uint32)
@@ -70,7 +70,7 @@ def version_4(parts, *, degree, count=COUNT, extension=b"", flags=0, streams=Non
 
 
 def decode(parts, i, *, version, bits):
-    """One splat after the format's description."""
+    """Decode one splat from the specification."""
     raw = parts["positions"][i].tobytes()
     if version == 1:
         position = list(struct.unpack("<3e", raw))
@@ -104,7 +104,7 @@ def decode(parts, i, *, version, bits):
     ("version", "packing"),
     [(1, "gzip"), (2, "gzip"), (3, "gzip"), (2, "none"), (3, "none"), (4, "zstd")],
 )
-def test_splats_are_decoded_as_described(rng, tmp_path, version, packing, degree):
+def test_splats_are_decoded_as_specified(rng, tmp_path, version, packing, degree):
     parts = random_parts(rng, version=version, degree=degree)
     if packing == "zstd":
         data = version_4(parts, degree=degree)
@@ -140,7 +140,7 @@ def test_extensions_are_skipped(rng, tmp_path):
     assert a.sh.tolist() == b.sh.tolist()
 
 
-def test_written_files_have_the_headers_described(make_cloud, tmp_path):
+def test_written_files_have_the_specified_headers(make_cloud, tmp_path):
     Spz(version=3).write(make_cloud(5, degree=2), tmp_path / "a.spz")
     Spz(version=4).write(make_cloud(5, degree=2), tmp_path / "b.spz")
     three, four = gzip.decompress((tmp_path / "a.spz").read_bytes()), (tmp_path / "b.spz")
@@ -164,7 +164,7 @@ def refuse(tmp_path, data, reason):
 
 
 @pytest.mark.parametrize("packed", [True, False])
-def test_what_is_cut_short_or_too_long_is_refused(parts, tmp_path, packed):
+def test_truncated_and_overlong_files_are_refused(parts, tmp_path, packed):
     whole = plain(parts, version=3, degree=1)
     pack = gzip.compress if packed else bytes
     refuse(tmp_path, pack(whole[:-1]), "truncated: the header promises 40 splats of degree 1")
@@ -172,7 +172,7 @@ def test_what_is_cut_short_or_too_long_is_refused(parts, tmp_path, packed):
     refuse(tmp_path, pack(whole + b"\0"), "longer than its header says")
 
 
-def test_a_gzip_stream_cut_anywhere_is_refused(parts, tmp_path):
+def test_a_gzip_stream_truncated_anywhere_is_refused(parts, tmp_path):
     whole = gzip.compress(plain(parts, version=3, degree=1))
     for end in range(12, len(whole) - 8, 17):
         (tmp_path / "a.spz").write_bytes(whole[:end])
@@ -180,7 +180,7 @@ def test_a_gzip_stream_cut_anywhere_is_refused(parts, tmp_path):
             read_splats(tmp_path / "a.spz")
 
 
-def test_a_version_4_file_cut_anywhere_is_refused(parts, tmp_path):
+def test_a_version_4_file_truncated_anywhere_is_refused(parts, tmp_path):
     whole = version_4(parts, degree=1)
     for end in range(4, len(whole), 13):
         (tmp_path / "a.spz").write_bytes(whole[:end])
@@ -188,7 +188,7 @@ def test_a_version_4_file_cut_anywhere_is_refused(parts, tmp_path):
             read_splats(tmp_path / "a.spz")
 
 
-def test_any_byte_of_version_4_may_break_without_another_error(parts, tmp_path):
+def test_damaged_version_4_files_raise_only_bundle_errors(parts, tmp_path):
     whole = version_4(parts, degree=1)
     for position in range(0, len(whole), 7):
         broken = bytearray(whole)
@@ -214,7 +214,7 @@ def test_any_byte_of_version_4_may_break_without_another_error(parts, tmp_path):
     ],
 )
 @pytest.mark.parametrize("packed", [True, False])
-def test_headers_that_make_no_sense_are_refused(parts, tmp_path, change, reason, packed):
+def test_invalid_headers_are_refused(parts, tmp_path, change, reason, packed):
     data = plain(parts, **{"version": 3, "degree": 1} | change)
     refuse(tmp_path, gzip.compress(data) if packed else data, reason)
 
@@ -229,11 +229,11 @@ def test_headers_that_make_no_sense_are_refused(parts, tmp_path, change, reason,
         ({"streams": 255}, "table of contents of 255 streams"),
     ],
 )
-def test_tables_of_contents_that_do_not_fit_are_refused(parts, tmp_path, change, reason):
+def test_inconsistent_tables_of_contents_are_refused(parts, tmp_path, change, reason):
     refuse(tmp_path, version_4(parts, **{"degree": 1} | change), reason)
 
 
-def test_positions_of_version_1_that_are_not_finite_are_refused(rng, tmp_path):
+def test_non_finite_positions_of_version_1_are_refused(rng, tmp_path):
     parts = random_parts(rng, version=1, degree=0)
     parts["positions"][3] = np.array([1, np.nan, np.inf], dtype="<f2").view(np.uint8)
     refuse(tmp_path, plain(parts, version=1, degree=0), "position is NaN or infinite in 1 of 40")
@@ -257,7 +257,7 @@ def test_a_zstd_bomb_is_not_inflated_beyond_its_header(tmp_path):
 
 
 def peak_bytes(file, reason):
-    """Largest memory while a file is refused; not counting what C libraries take of their own."""
+    """Peak Python memory while a file is refused, without allocations of C libraries."""
     tracemalloc.start()
     try:
         with pytest.raises(BundleError, match=reason):
@@ -267,13 +267,13 @@ def peak_bytes(file, reason):
         tracemalloc.stop()
 
 
-def test_a_gzip_file_of_something_else_is_no_spz(tmp_path):
+def test_an_unrelated_gzip_file_is_refused(tmp_path):
     (tmp_path / "a.spz").write_bytes(gzip.compress(b"hello world, hello world"))
     with pytest.raises(BundleError, match="not a ply nor any other known splat format"):
         read_splats(tmp_path / "a.spz")
 
 
-def test_a_suffix_does_not_matter_to_reading(make_cloud, tmp_path):
+def test_reading_ignores_the_suffix(make_cloud, tmp_path):
     write_splats(make_cloud(5), tmp_path / "a.spz")
     (tmp_path / "a.spz").rename(tmp_path / "a.ply")
     assert len(read_splats(tmp_path / "a.ply")) == 5

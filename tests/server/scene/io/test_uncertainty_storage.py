@@ -26,13 +26,13 @@ def known(cloud):
 
 @pytest.fixture
 def certain(scene):
-    """The scene with uncertainties of everything."""
+    """The scene with uncertainties for all Gaussians and the sky."""
     objects = {name: replace(o, cloud=known(o.cloud)) for name, o in scene.objects.items()}
     sky = replace(scene.sky, uncertainties=scene.sky.faces.mean(-1).clamp(0, 1))
     return replace(scene, background=known(scene.background), objects=objects, sky=sky)
 
 
-def test_uncertainties_come_back_as_they_were(certain, tmp_path):
+def test_uncertainties_round_trip(certain, tmp_path):
     save_scene(certain, tmp_path / "a.r2s")
     assert read_scene_summary(tmp_path / "a.r2s").has_uncertainties
     read = load_scene(tmp_path / "a.r2s")
@@ -50,7 +50,7 @@ def test_a_scene_without_uncertainties_has_none(scene, tmp_path):
     assert read.background.uncertainties is read.sky.uncertainties is None
 
 
-def test_assets_keep_them(scene, tmp_path):
+def test_assets_keep_uncertainties(scene, tmp_path):
     cloud = scene.object("car_3").cloud
     for name, kept in (("a", known(cloud)), ("b", cloud)):
         saved = save_asset(Asset("taxi", "car", (4.0, 2.0, 1.5), kept), tmp_path / name)
@@ -61,7 +61,7 @@ def test_assets_keep_them(scene, tmp_path):
     assert torch.equal(load_asset(tmp_path / "a").cloud.uncertainties, known(cloud).uncertainties)
 
 
-def test_changed_ones_are_noticed(certain, tmp_path):
+def test_changed_uncertainties_are_detected(certain, tmp_path):
     save_scene(certain, tmp_path / "a.r2s")
     file = tmp_path / "a.r2s" / "background.safetensors"
     stored = known(certain.background).uncertainties.numpy().tobytes()
@@ -72,7 +72,7 @@ def test_changed_ones_are_noticed(certain, tmp_path):
         load_scene(tmp_path / "a.r2s")
 
 
-def test_values_that_are_none_are_not_written(certain, tmp_path):
+def test_invalid_uncertainties_are_refused(certain, tmp_path):
     sky = Sky(certain.sky.faces, torch.full_like(certain.sky.uncertainties, 2.0))
     with pytest.raises(SceneError, match=r"sky: uncertainties hold values outside \[0, 1\]"):
         save_scene(replace(certain, sky=sky), tmp_path / "a.r2s")
@@ -80,7 +80,7 @@ def test_values_that_are_none_are_not_written(certain, tmp_path):
         Sky(certain.sky.faces, torch.zeros(6, 1, 2))
 
 
-def test_packed_scenes_hold_them_to_a_step_of_their_roots(certain, scene, tmp_path):
+def test_packed_scenes_quantise_the_root_of_uncertainties(certain, scene, tmp_path):
     write_packed(certain, tmp_path / "a.r2s.zip")
     read = read_packed(tmp_path / "a.r2s.zip")
     given, back = (s.background.uncertainties.sqrt().sort().values for s in (certain, read))
