@@ -1,10 +1,10 @@
 #!/bin/sh
-# Builds an image with buildah, where there is no Docker and no registry, on a base made by
-# debootstrap, and runs it through its health check as its user on a read-only root.
+# Builds an image with buildah on a base made by debootstrap, without Docker or a registry, and runs
+# its health check as its user on a read-only root.
 #   docker/build.sh [cpu|gpu] [-- options of `buildah bud`]
-# As root; needs buildah and debootstrap. MIRROR is a mirror of Debian, SUITE its release. What pip and
-# apt need inside (an index, certificates) is given after `--` as files, `--volume HOST:PLACE:ro`, of which
-# an empty file stays in the image; what `--env` gives stays there as it is.
+# Run it as root; it needs buildah and debootstrap. MIRROR is a mirror of Debian, SUITE its release. Mount
+# files that pip and apt need (an index, certificates) after `--` with `--volume HOST:PLACE:ro`; the image
+# keeps an empty file of each. Values of `--env` stay in the image.
 set -eu
 kind=${1:-cpu}
 [ $# -gt 0 ] && shift
@@ -39,7 +39,7 @@ buildah bud --format docker --isolation chroot --layers=false --build-arg BASE_I
     -f "docker/Dockerfile.$kind" -t "real2sim:$kind" "$@" .
 [ -z "$before" ] || buildah rmi "$before" >/dev/null || true
 
-# The health check, as the image's user on a root that cannot be written to.
+# The health check, as the image's user on a read-only root.
 container=$(buildah from "real2sim:$kind")
 user=$(buildah inspect --format '{{.OCIv1.Config.User}}' "real2sim:$kind")
 case $user in ""|root|0|0:*) echo "the image runs as root" >&2; exit 1 ;; esac

@@ -151,8 +151,8 @@ def learn(*, json: JsonFile = None) -> None:
 @command("soak", group=app)
 def soak(
     *,
-    sessions: Annotated[int, typer.Option(min=1, max=32)] = 16,
-    minutes: Annotated[float, typer.Option(min=0.1, max=1440)] = 10.0,
+    sessions: Annotated[int, typer.Option(min=1, max=32, help="Number of sessions.")] = 16,
+    minutes: Annotated[float, typer.Option(min=0.1, max=1440, help="Duration [min].")] = 10.0,
     rate: Annotated[
         float, typer.Option(min=0.1, max=1000, help="Steps per second and session.")
     ] = 10.0,
@@ -172,7 +172,7 @@ def soak(
 @command("edit", group=app)
 def edit(
     *,
-    operations: Annotated[int, typer.Option(min=1, max=100_000)] = 1000,
+    operations: Annotated[int, typer.Option(min=1, max=100_000, help="Number of edits.")] = 1000,
     json: JsonFile = None,
 ) -> None:
     """Measure an edit, and opening a scenario with many edits."""
@@ -205,7 +205,7 @@ def recovery(
     ] = None,
     episodes: Annotated[int, typer.Option(min=8, max=1000, help="Episodes per planner.")] = 64,
     epochs: Annotated[int, typer.Option(min=1, max=10_000, help="Training epochs.")] = 300,
-    seed: Annotated[int, typer.Option(min=0, max=1_000_000)] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=1_000_000, help="Seed of the training.")] = 0,
     json: JsonFile = None,
 ) -> None:
     """Compare the learned planner with and without recovery data."""
@@ -227,7 +227,7 @@ def detector(
     frames: Annotated[int, typer.Option(min=20, max=100_000, help="Training frames.")] = 2000,
     epochs: Annotated[int, typer.Option(min=1, max=1000, help="Training epochs.")] = 8,
     drives: Annotated[int, typer.Option(min=1, max=100, help="Test drives.")] = 4,
-    seed: Annotated[int, typer.Option(min=0, max=1_000_000)] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=1_000_000, help="Seed of the training.")] = 0,
     workers: Annotated[int, typer.Option(min=1, max=64, help="Export processes.")] = 1,
     json: JsonFile = None,
 ) -> None:

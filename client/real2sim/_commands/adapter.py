@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 app = typer.Typer()
-adapters = typer.Typer(no_args_is_help=True, help="Render for another simulator that drives.")
+adapters = typer.Typer(no_args_is_help=True, help="Render images for other simulators.")
 app.add_typer(adapters, name="adapter")
 
 Host = Annotated[str, typer.Option(help="Address to listen on.")]

@@ -82,15 +82,15 @@ def drive(
         str | None,
         typer.Option(
             metavar="JSON",
-            help="Road users come and go along the route: agents.spawn of reset, '{}' for its "
-            "defaults, for example '{\"density\": 30}'.",
+            help="Spawn road users along the route: JSON of agents.spawn, for example "
+            "'{\"density\": 30}'; '{}' uses the defaults.",
         ),
     ] = None,
     randomization: Annotated[
         str | None,
         typer.Option(
             metavar="JSON",
-            help='Randomization of reset, drawn with --seed, for example \'{"start": '
+            help='Randomization of reset, sampled with --seed, as JSON, for example \'{"start": '
             '{"lateral": 0.5}}\'.',
         ),
     ] = None,

@@ -57,7 +57,7 @@ def doctor(
     arch: Annotated[
         list[str] | None,
         typer.Option(
-            help="With --build-gpu and the options about kernels: sm_90 ...; default: of this GPU."
+            help="GPU architecture to compile for, such as sm_90; repeatable. Default: this GPU's."
         ),
     ] = None,
     need_cuda: Annotated[
@@ -73,24 +73,24 @@ def doctor(
         bool,
         typer.Option(
             "--serving-kernels",
-            help="Compile the kernels of --backend nvrtc, for images and LiDAR, for --arch, by "
-            "default for all that are tested, and say what each takes; fails where one spills. "
-            "Needs no GPU.",
+            help="Compile the kernels of --backend nvrtc, for images and LiDAR, for each --arch "
+            "(default: all tested ones) and print their registers and occupancy; fail if one "
+            "spills registers. Needs no GPU.",
         ),
     ] = False,
     solver_kernels: Annotated[
         bool,
         typer.Option(
             "--solver-kernels",
-            help="The same for the CUDA kernels of the physics solver, in both precisions.",
+            help="The same for the physics solver's CUDA kernels, in both precisions.",
         ),
     ] = False,
     gpu_check: Annotated[
         bool,
         typer.Option(
             "--gpu-check",
-            help="Try this machine's GPU in some minutes: its pictures and training against the "
-            "CPU's, times of frames, physics, memory. Fails where something is not right.",
+            help="Test this machine's GPU: compare images, LiDAR and training with the CPU, and "
+            "measure frames, physics and memory. Takes minutes; fails if a comparison fails.",
         ),
     ] = False,
     out: Annotated[

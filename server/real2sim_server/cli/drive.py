@@ -445,8 +445,8 @@ def search(
     ],
     planner: Annotated[str, typer.Option(help="Planner as for `drive`, see docs/policies.md.")],
     out: Annotated[Path, typer.Option("--out", help="Output folder for failures and the report.")],
-    episodes: Annotated[int, typer.Option(min=20, max=100_000)] = 300,
-    seed: Annotated[int, typer.Option(min=0)] = 0,
+    episodes: Annotated[int, typer.Option(min=20, max=100_000, help="Number of episodes.")] = 300,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the search.")] = 0,
     shrink: Annotated[
         int, typer.Option(min=0, help="Number of failures to shrink to their boundary.")
     ] = 3,

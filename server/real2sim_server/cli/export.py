@@ -275,8 +275,8 @@ def export_dataset(
     lidar: Annotated[
         str | None,
         typer.Option(
-            help="hdl-64e, os1-128 ... or a JSON file (docs/lidar.md): its returns are the "
-            "labelled points. Default: points of what the cameras see."
+            help="LiDAR whose returns are the labelled points: hdl-64e, os1-128, ... or a JSON "
+            "file (docs/lidar.md); default: points seen by the cameras."
         ),
     ] = None,
     rig: Annotated[
@@ -293,7 +293,7 @@ def export_dataset(
     noise: Annotated[
         str | None,
         typer.Option(
-            help="Boxes as a detector would give them: position=0.2,size=0.05,heading=2,"
+            help="Add boxes with the errors of a detector: position=0.2,size=0.05,heading=2,"
             "missed=0.1,false=0.5."
         ),
     ] = None,

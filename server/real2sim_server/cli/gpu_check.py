@@ -149,15 +149,15 @@ class GpuCheck:
     @property
     def right(self) -> bool:
         """Whether every part ran and all comparisons agree, regardless of speed."""
-        compared = (f.holds for f in self.findings if f.part in ("pictures", "lidar", "training"))
+        compared = (f.holds for f in self.findings if f.part in ("images", "lidar", "training"))
         return not self.failed and False not in compared
 
     def markdown(self) -> str:
         """The results as a Markdown table, as in ``docs/gpu.md``."""
         lines = [f"Checked on {self.date}: {self.device}", ""]
-        lines += ["| Part | What | Found | Wanted |", "|---|---|---|---|"]
+        lines += ["| Part | Check | Measured | Target |", "|---|---|---|---|"]
         for finding in self.findings:
-            mark = {None: "", True: " (holds)", False: " (**does not hold**)"}[finding.holds]
+            mark = {None: "", True: " (met)", False: " (**not met**)"}[finding.holds]
             lines.append(
                 f"| {finding.part} | {finding.what} | {finding.found} | {finding.wanted}{mark} |"
             )
@@ -227,7 +227,7 @@ def _install(devices: Devices, scale: Scale) -> Iterator[Finding]:
         yield _note(f"37 MB to {name} memory", f"{ms:.2f} ms")
 
 
-def _pictures(devices: Devices, scale: Scale) -> Iterator[Finding]:
+def _images(devices: Devices, scale: Scale) -> Iterator[Finding]:
     """Images of the serving kernels and the CPU backend, at several distances from the origin."""
     serving, cpu = devices.serving(), select_backend("cpu")
     width = scale.compared_width
@@ -242,7 +242,11 @@ def _pictures(devices: Devices, scale: Scale) -> Iterator[Finding]:
         apart = max(int(np.abs(a.rgb.astype(int) - b.rgb).max()) for a, b in pairs)
         where = f"{distance / 1e3:g} km from the origin"
         yield Finding(
-            "", f"colour apart from the CPU's, {where}", f"{apart} levels", "1", apart <= 1
+            "",
+            f"largest colour difference from the CPU, {where}",
+            f"{apart} levels",
+            "1",
+            apart <= 1,
         )
         for name in ("instance", "semantic"):
             differ = sum(int((a.images[name] != b.images[name]).sum()) for a, b in pairs)
@@ -251,7 +255,11 @@ def _pictures(devices: Devices, scale: Scale) -> Iterator[Finding]:
         both = [(a.images["median_depth"], b.images["median_depth"]) for a, b in pairs]
         share = float(np.mean([np.abs(a - b) > 1e-3 for a, b in both]))
         yield Finding(
-            "", f"median depths 1 mm apart, {where}", f"{share:.2%}", "0.1 %", share <= 1e-3
+            "",
+            f"median depths that differ by 1 mm, {where}",
+            f"{share:.2%}",
+            "0.1 %",
+            share <= 1e-3,
         )
 
 
@@ -269,10 +277,12 @@ def _lidar(devices: Devices, scale: Scale) -> Iterator[Finding]:
     caster = devices.casting()
     found, expected = caster.cast(request), select_caster("cpu").cast(request)
     differ = float((found.member != expected.member).mean())
-    yield Finding("", "rays that end elsewhere", f"{differ:.3%}", "0.1 %", differ <= 1e-3)
+    yield Finding("", "rays that hit another Gaussian", f"{differ:.3%}", "0.1 %", differ <= 1e-3)
     same = (found.member == expected.member) & expected.hit
     apart = float(np.abs(found.range - expected.range)[same].max(initial=0.0))
-    yield Finding("", "ranges of the others apart", f"{apart * 1e3:.3f} mm", "1 mm", apart <= 1e-3)
+    yield Finding(
+        "", "largest range difference of the others", f"{apart * 1e3:.3f} mm", "1 mm", apart <= 1e-3
+    )
     times = _times_ms(partial(caster.cast, request), scale.repeats)
     yield _timed(f"{beams.count:,} rays, two returns", times, None)
 
@@ -381,7 +391,7 @@ def _memory(devices: Devices, scale: Scale) -> Iterator[Finding]:
 
 PARTS: dict[str, Callable[[Devices, Scale], Iterator[Finding]]] = {
     "install": _install,
-    "pictures": _pictures,
+    "images": _images,
     "lidar": _lidar,
     "frames": _frames,
     "physics": _physics,

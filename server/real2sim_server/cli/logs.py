@@ -23,14 +23,14 @@ if TYPE_CHECKING:
 def synth(
     *,
     out: Annotated[Path, typer.Option("--out", help="Output folder.")],
-    frames: Annotated[int, typer.Option(min=2, max=10_000)] = 60,
-    seed: Annotated[int, typer.Option(min=0)] = 0,
+    frames: Annotated[int, typer.Option(min=2, max=10_000, help="Number of frames.")] = 60,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the street.")] = 0,
     width: Annotated[int, typer.Option(min=32, max=4096, help="Image width [px].")] = 480,
     height: Annotated[int, typer.Option(min=32, max=4096, help="Image height [px].")] = 320,
-    moving_cars: Annotated[int, typer.Option(min=0, max=40)] = 4,
-    parked_cars: Annotated[int, typer.Option(min=0, max=80)] = 14,
+    moving_cars: Annotated[int, typer.Option(min=0, max=40, help="Number of moving cars.")] = 4,
+    parked_cars: Annotated[int, typer.Option(min=0, max=80, help="Number of parked cars.")] = 14,
     pedestrians: Annotated[int, typer.Option(min=0, max=60, help="Number of pedestrians.")] = 0,
-    cyclists: Annotated[int, typer.Option(min=0, max=20)] = 0,
+    cyclists: Annotated[int, typer.Option(min=0, max=20, help="Number of cyclists.")] = 0,
     json: JsonFile = None,
 ) -> None:
     """Generate a log of a procedural street: cameras, LiDAR, exact poses and boxes."""
@@ -135,12 +135,10 @@ def track(
     reach: Annotated[
         float, typer.Option(min=5, max=200, help="Maximum distance from the vehicle [m].")
     ] = 55.0,
-    least_distance: Annotated[
+    min_distance: Annotated[
         float, typer.Option(min=0.1, help="Minimum distance that an object travels [m].")
     ] = 1.5,
-    least_frames: Annotated[
-        int, typer.Option(min=2, help="Minimum frames in which it is seen.")
-    ] = 6,
+    min_frames: Annotated[int, typer.Option(min=2, help="Minimum frames in which it is seen.")] = 6,
     images: Annotated[
         str, typer.Option(help="Image format: png (lossless) or jpg (smaller).")
     ] = "jpg",
@@ -156,14 +154,14 @@ def track(
 
     refuse_existing(out, overwrite=False)
     opened = open_log(log, format=log_format, sequence=sequence)
-    options = TrackingOptions(reach=reach, least_distance=least_distance, least_frames=least_frames)
+    options = TrackingOptions(reach=reach, min_distance=min_distance, min_frames=min_frames)
     start = time.perf_counter()
     with progress("tracking") as report:
         found = track_moving_objects(opened, options, on_progress=report)
     if not found:
         raise CommandError(
-            f"nothing that moves was found in the LiDAR of {log}; a lower --least-distance or "
-            "--least-frames finds more"
+            f"nothing that moves was found in the LiDAR of {log}; a lower --min-distance or "
+            "--min-frames finds more"
         )
     tracked = replace(opened, tracks=merge_tracks(opened.tracks if keep else (), found))
     with progress("writing the log") as report:

@@ -53,8 +53,8 @@ def evaluate_policy(
     suite: Annotated[
         Path | None,
         typer.Option(
-            help="JSON file of cases instead, or a shipped suite's name. With none: `demo`, the "
-            "demo's street three ways."
+            help="JSON file of cases, or name of a shipped suite; default: demo, three cases on "
+            "the demo street."
         ),
     ] = None,
     seeds: Annotated[
@@ -62,8 +62,8 @@ def evaluate_policy(
         typer.Option(
             min=1,
             max=1000,
-            help="How many, from 0 on, of each case in which something is random: jitter, or "
-            "randomization or agents.spawn of its reset; default 3. Others are driven once.",
+            help="Number of seeds for cases with random parts (jitter, randomization, "
+            "agents.spawn); default: 3. Other cases are driven once.",
         ),
     ] = None,
     reset: Annotated[
@@ -76,7 +76,12 @@ def evaluate_policy(
     url: Annotated[
         str | None, typer.Option(help="Address of a running worker; default: start one.")
     ] = None,
-    token: Annotated[str | None, typer.Option(envvar="REAL2SIM_TOKEN", show_default=False)] = None,
+    token: Annotated[
+        str | None,
+        typer.Option(
+            envvar="REAL2SIM_TOKEN", show_default=False, help="Bearer token of the worker."
+        ),
+    ] = None,
     scenes_dir: Annotated[
         Path | None,
         typer.Option("--scenes", help="Folder of bundles for the worker that is started."),
@@ -241,12 +246,12 @@ def train_policy(
     camera: Annotated[
         str | None, typer.Option(help="Camera; default: the most forward-facing.")
     ] = None,
-    epochs: Annotated[int, typer.Option(min=1, max=100_000)] = 60,
+    epochs: Annotated[int, typer.Option(min=1, max=100_000, help="Training epochs.")] = 60,
     shifted: Annotated[
         int,
         typer.Option(min=0, max=100, help="Rendered views off the path per frame of a scene."),
     ] = 5,
-    seed: Annotated[int, typer.Option(min=0)] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the training.")] = 0,
     log_format: LogFormat = None,
     sequence: SequenceName = None,
     json: JsonFile = None,

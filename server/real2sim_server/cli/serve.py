@@ -21,7 +21,7 @@ def serve(
     *,
     host: Annotated[
         str | None,
-        typer.Option(help="Address to listen on; others than 127.0.0.1 (default) need a token."),
+        typer.Option(help="Address to listen on, 127.0.0.1 by default; any other needs a token."),
     ] = None,
     port: Annotated[
         int | None, typer.Option(min=0, max=65535, help="Port; 0 picks a free one.")
@@ -117,7 +117,7 @@ def _warn(message: str) -> None:
 def demo(
     *,
     out: Annotated[Path, typer.Option("--out", help="Output folder.")] = Path("out/demo"),
-    steps: Annotated[int, typer.Option(min=1, max=10_000)] = 100,
+    steps: Annotated[int, typer.Option(min=1, max=10_000, help="Steps to drive.")] = 100,
     from_log: Annotated[
         bool, typer.Option("--from-log", help="Record and reconstruct the street first.")
     ] = False,

@@ -369,7 +369,7 @@ def points_at(
     *,
     part: Part = "all",
     instance_id: int | None = None,
-    least_opacity: float = MIN_OPACITY,
+    min_opacity: float = MIN_OPACITY,
 ) -> NDArray[np.void]:
     """Points of a scenario at a time, as an array of dtype ROW.
 
@@ -382,7 +382,7 @@ def points_at(
         t_us: time [us].
         part: part of the scene.
         instance_id: id of a single object; None for all.
-        least_opacity: minimum opacity of a Gaussian.
+        min_opacity: minimum opacity of a Gaussian.
 
     Raises:
         UnknownObjectError: ``state`` is of another scene.
@@ -393,7 +393,7 @@ def points_at(
         objects = [i for i in objects if i.instance_id == instance_id]
     kept = [background] if part != "objects" and instance_id is None else []
     kept += objects if part != "background" else []
-    rows = [_rows(scene, instance, least_opacity) for instance in kept]
+    rows = [_rows(scene, instance, min_opacity) for instance in kept]
     return np.concatenate(rows) if rows else np.zeros(0, ROW)
 
 
@@ -406,11 +406,11 @@ def ply_of_points(rows: NDArray[np.void]) -> Iterable[bytes]:
     yield rows.tobytes()
 
 
-def _rows(scene: Scene, instance: Instance, least_opacity: float) -> NDArray[np.void]:
+def _rows(scene: Scene, instance: Instance, min_opacity: float) -> NDArray[np.void]:
     cloud = instance.cloud
     if instance.colour is not None:
         cloud = instance.colour.at(cloud, instance.t_us)
-    seen = (cloud.opacities >= least_opacity).cpu().numpy()
+    seen = (cloud.opacities >= min_opacity).cpu().numpy()
     means = cloud.means.cpu().numpy()[seen].astype(np.float64)
     scale = np.asarray(instance.scale)
     scales = cloud.scales.cpu().numpy()[seen] * scale

@@ -51,16 +51,16 @@ class TrackingOptions:
 
     Attributes:
         reach: maximum distance from the vehicle along each axis [m].
-        least_distance: minimum travelled distance [m].
-        least_speed: minimum mean speed [m/s].
-        least_frames: minimum number of frames with the object.
+        min_distance: minimum travelled distance [m].
+        min_speed: minimum mean speed [m/s].
+        min_frames: minimum number of frames with the object.
         max_missed: a track ends after this many frames without a cluster.
     """
 
     reach: float = 55.0
-    least_distance: float = 1.5
-    least_speed: float = 0.5
-    least_frames: int = 6
+    min_distance: float = 1.5
+    min_speed: float = 0.5
+    min_frames: int = 6
     max_missed: int = 4
 
 
@@ -118,7 +118,7 @@ def _sweep_rays(sweep: LidarSweep, pose: Float) -> SweepRays:
 
 def _has_moved(track: Track, times: Float, options: TrackingOptions) -> bool:
     """A fast first test with half of the required distance and speed."""
-    if len(track.clusters) < max(3, options.least_frames // 2):
+    if len(track.clusters) < max(3, options.min_frames // 2):
         return False
     frames = sorted(track.clusters)
     centres = np.array([track.clusters[f].centre for f in frames])
@@ -126,8 +126,7 @@ def _has_moved(track: Track, times: Float, options: TrackingOptions) -> bool:
     displacement = np.linalg.norm(centres[-ends:].mean(axis=0) - centres[:ends].mean(axis=0))
     seconds = times[frames[-1]] - times[frames[0]]
     return bool(
-        displacement > options.least_distance / 2
-        and displacement > options.least_speed / 2 * seconds
+        displacement > options.min_distance / 2 and displacement > options.min_speed / 2 * seconds
     )
 
 
@@ -200,17 +199,16 @@ def _moves_like_object(
     clusters: Mapping[int, LidarCluster], box: FittedBox, times: Float, options: TrackingOptions
 ) -> bool:
     length, width, height = box.size
-    if len(clusters) < options.least_frames or length > MAX_LENGTH or width > MAX_WIDTH:
+    if len(clusters) < options.min_frames or length > MAX_LENGTH or width > MAX_WIDTH:
         return False
     steps = np.linalg.norm(np.diff(box.centres[:, :2], axis=0), axis=1)
     displacement = float(np.linalg.norm(box.centres[-1, :2] - box.centres[0, :2]))
     seconds = times[box.frames[-1]] - times[box.frames[0]]
-    if height > MAX_HEIGHT or displacement < options.least_distance or box.residual > MAX_RESIDUAL:
+    if height > MAX_HEIGHT or displacement < options.min_distance or box.residual > MAX_RESIDUAL:
         return False
     path_length = float(steps.sum())
     return (
-        path_length > options.least_speed * seconds
-        and displacement > MIN_STRAIGHTNESS * path_length
+        path_length > options.min_speed * seconds and displacement > MIN_STRAIGHTNESS * path_length
     )
 
 

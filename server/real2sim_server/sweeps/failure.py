@@ -297,7 +297,7 @@ def _card(failure: Failure) -> str:
     ]
     for edge in failure.boundaries[:2]:
         lines.append(
-            f"<p>It goes well with <b>{escape(edge.parameter)}</b> {_number(edge.first_pass)} "
+            f"<p>No failure with <b>{escape(edge.parameter)}</b> {_number(edge.first_pass)} "
             f"instead of {_number(edge.failing)}.</p>"
         )
     if failure.film:

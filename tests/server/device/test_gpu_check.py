@@ -42,14 +42,14 @@ def devices(training: str | Backend = "cpu") -> Devices:
 def test_images_and_timings_are_checked_and_reported_as_a_table(
     device_counts: pretended.Counts,
 ) -> None:
-    check = run(devices(), SMALL, parts=["pictures", "lidar", "frames", "memory"])
+    check = run(devices(), SMALL, parts=["images", "lidar", "frames", "memory"])
     assert check.failed == {}
     assert check.right
     text = check.markdown()
     assert text.startswith(f"Checked on {check.date}: pretended\n\n| Part |")
     assert ": jpeg by libjpeg-turbo" in text
-    assert "10 km from the origin | 0 | 0 (holds) |" in text
-    assert "rays that end elsewhere | 0.000% | 0.1 % (holds) |" in text
+    assert "10 km from the origin | 0 | 0 (met) |" in text
+    assert "rays that hit another Gaussian | 0.000% | 0.1 % (met) |" in text
 
 
 def test_a_failing_part_reports_its_error_and_the_others_run() -> None:

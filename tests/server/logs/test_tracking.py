@@ -99,7 +99,7 @@ def test_boxes_rest_on_the_road_and_have_names(found: tuple[ObjectTrack, ...]) -
 
 def test_tracking_is_reproducible(drive: DrivingLog) -> None:
     short = dataclasses.replace(drive, frame_times_us=drive.frame_times_us[:8])
-    options = TrackingOptions(least_distance=1.0)
+    options = TrackingOptions(min_distance=1.0)
     one, two = (track_moving_objects(short, options) for _ in range(2))
     assert [t.object_id for t in one] == [t.object_id for t in two]
     for a, b in zip(one, two, strict=True):

@@ -170,16 +170,16 @@ class AroundScore:
 
 
 def evaluate_around(
-    scene: Scene, truth: SyntheticLog, *, least_views: int = 5, backend: str = "auto"
+    scene: Scene, truth: SyntheticLog, *, min_views: int = 5, backend: str = "auto"
 ) -> AroundScore:
-    """Render every vehicle visible in at least ``least_views`` logged images from all sides.
+    """Render every vehicle visible in at least ``min_views`` logged images from all sides.
 
     Each vehicle is rendered alone, at the middle of its time span, from eight azimuths.
     """
     sides: list[SideScore] = []
     for index, track in enumerate(truth.tracks):
         logged_from = logged_azimuths(truth, track)
-        if track.object_id in scene.objects and len(logged_from) >= least_views:
+        if track.object_id in scene.objects and len(logged_from) >= min_views:
             sides += _sides(scene, truth, index, logged_from, backend)
     return AroundScore(
         psnr_seen=mean_psnr(s.psnr for s in sides if s.seen),

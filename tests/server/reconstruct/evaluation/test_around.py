@@ -59,10 +59,10 @@ def test_a_missing_vehicle_half_lowers_coverage(street):
     scene = initialise_scene(street, options=options)
     name = street.tracks[0].object_id
     only = replace(scene, objects={name: scene.objects[name]})
-    whole = evaluate_around(only, street, least_views=2)
+    whole = evaluate_around(only, street, min_views=2)
     item = only.objects[name]
     half = replace(item, cloud=item.cloud.select(item.cloud.means[:, 0] > 0))
-    cut = evaluate_around(replace(only, objects={name: half}), street, least_views=2)
+    cut = evaluate_around(replace(only, objects={name: half}), street, min_views=2)
     assert {side.object_id for side in whole.sides} == {name}
     assert 0 < sum(side.seen for side in whole.sides) < len(whole.sides)
     assert whole.coverage_unseen > 0.9

@@ -13,7 +13,7 @@ template <class T> struct alignas(16) Four { T x, y, z, w; };
 
 constexpr double INFINITE = 1.7e308;  // Beyond all that is compared with it.
 
-// As NumPy and Numba have them: what is no number loses every comparison.
+// As in NumPy and Numba: NaN loses every comparison.
 template <class T> __device__ __forceinline__ T least(T a, T b) { return b < a ? b : a; }
 template <class T> __device__ __forceinline__ T greatest(T a, T b) { return b > a ? b : a; }
 template <class T> __device__ __forceinline__ T squared(T x) { return x * x; }

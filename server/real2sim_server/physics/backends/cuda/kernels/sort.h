@@ -19,7 +19,7 @@ extern "C" __global__ void __launch_bounds__(THREADS) find_keys(const Space* giv
         for (int axis = 0; axis < 3; ++axis) {
             const real xi = all.at(XI + axis, p), v = all.at(VELOCITY + axis, p);
             const real shift = rounded_down((xi - real(0.5)) / BLOCK);
-            // More than a few blocks in one go is no motion but a solver that diverges.
+            // A motion of more than a few blocks at once means that the solver diverges.
             if (!(magnitude(shift) <= real(1024)) || !(magnitude(v) <= real(1e30))) {
                 atomicOr(&space.held->fault, DIVERGED);
                 return;

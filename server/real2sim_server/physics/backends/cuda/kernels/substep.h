@@ -226,7 +226,7 @@ __device__ __forceinline__ void advance_particle(
         const real stride = dt / dx;
         for (int axis = 0; axis < 3; ++axis) {
             xi[axis] += stride * v[axis];
-            // What is no number fails both comparisons, so it has left.
+            // NaN fails both comparisons, so the particle counts as gone.
             stays = stays && xi[axis] >= LOWEST && xi[axis] < HIGHEST;
         }
         all.put(XI, p, xi);
