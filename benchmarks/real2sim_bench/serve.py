@@ -379,7 +379,9 @@ def _parts(latencies: Sequence[float], stages: Sequence[Mapping[str, float]]) ->
     """Milliseconds by stage, outside stages, and of overhead (neither render nor physics), and the
     median fraction of a step outside render."""
     total = np.array(latencies)
-    by_stage = {name: np.array([s.get(name, 0.0) for s in stages]) for name in stages[-1]}
+    names = dict.fromkeys(name for stage in stages for name in stage)
+    by_stage = {name: np.array([s.get(name, 0.0) for s in stages]) for name in names}
+    share_rendering = by_stage["render"] / total if "render" in by_stage else np.zeros(len(total))
     device = sum(
         (by_stage[name] for name in DEVICE_STAGES if name in by_stage), np.zeros(len(total))
     )
@@ -389,7 +391,7 @@ def _parts(latencies: Sequence[float], stages: Sequence[Mapping[str, float]]) ->
         "p50_by_stage_ms": {name: row["p50"] for name, row in spread.items()},
         "by_stage_ms": spread,
         "overhead_ms": percentiles((total - device).tolist()),
-        "share_not_render": float(np.median(1 - by_stage["render"] / total)),
+        "share_not_render": float(np.median(1 - share_rendering)),
     }
 
 

@@ -214,7 +214,13 @@ class Renderer:
     async def encode(
         self, images: Iterable[RenderedImage], *, priority: Priority = Priority.DRIVE
     ) -> list[EncodedFrame]:
-        """Encode images on the encoder threads; returns their frames in order."""
+        """Encode images; returns their frames in order.
+
+        Complete raw images are used as they are; all others are encoded on the encoder threads.
+        """
+        images = list(images)
+        if all(image.ready is at_once and image.sensor.codec == "raw" for image in images):
+            return [encode_frame(image) for image in images]
         return await self.on_encoders(
             partial(encode_frame, jpeg=self.jpeg), images, priority=priority
         )

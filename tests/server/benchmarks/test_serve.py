@@ -37,6 +37,12 @@ def test_pauses_are_summarized_over_all_cores():
     assert (figures["per_second"] > 0) == (figures["longest_ms"] > 0)
 
 
+def test_steps_without_sensors_have_no_render_stage():
+    parts = serve._parts([1.0, 2.0], [{"world": 0.25}, {"world": 0.5, "encode": 0.5}])
+    assert parts["share_not_render"] == 1
+    assert parts["p50_by_stage_ms"] == {"world": 0.375, "encode": 0.25, "socket and rest": 0.875}
+
+
 @pytest.mark.slow
 def test_a_short_run_reports_all_figures_as_json(capsys):
     options = serve.ServeBenchOptions(

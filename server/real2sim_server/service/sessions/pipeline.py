@@ -9,8 +9,8 @@ phase         runs on         purpose
 ``render``    engine          deformations, then images and clouds of the due sensors
 ``evaluate``  worlds, during  metrics and events; write the log entry; pack the observation without
               rendering       its images
-``encode``    encoders        encode images or copy raw ones into shared memory; join the parts into
-                              one message
+``encode``    event loop,     take raw images as they are; encode others or copy them into shared
+              encoders        memory on the encoders; join the parts into one message
 ``send``      event loop      write the message to the socket (`connection`)
 ============  ==============  ====================================================================
 
@@ -365,12 +365,13 @@ class StepPipeline:
 
     async def encode(self, step: Step, kind: str) -> EncodedObservation:
         """The encoded observation; counted when the reply is sent."""
-        if step.images or step.measured:
-            frames = await self._renderer.encode(step.images)
+        frames = await self._renderer.encode(step.images)
+        if step.measured or (frames and step.slot is not None):
+            # Compressing clouds and copying to shared memory would delay the event loop.
             pack = partial(_packed, step, kind)
             (observation,) = await self._renderer.on_encoders(pack, [frames])
         else:
-            observation = _packed(step, kind, ())
+            observation = _packed(step, kind, frames)
         asyncio.get_running_loop().call_soon(self._count, observation)
         return observation
 
