@@ -379,10 +379,17 @@ def gallery_picture(name: str) -> Call[bytes]:
 
 
 def read_xosc(
-    scenario_id: str, content: bytes, leave_out: Sequence[str], ego: str | None, etag: str
+    scenario_id: str,
+    content: bytes,
+    leave_out: Sequence[str],
+    ego: str | None,
+    etag: str,
+    *,
+    strict: bool,
 ) -> Call[StoryboardResult]:
     query = [("leave_out", name) for name in leave_out]
     query += [] if ego is None else [("ego", ego)]
+    query += [("strict", "true")] if strict else []
     path = f"{_scenario(scenario_id)}/storyboard.xosc"
     path += f"?{urlencode(query)}" if query else ""
     request = file_put(path, content, "application/xml", if_match=etag)

@@ -500,12 +500,20 @@ class SetVariableAction(Model):
     rule: Literal["set", "add", "multiply"] = "set"
 
 
+class CustomAction(Model):
+    """Does nothing; keeps the place of an action that has no effect here, such as lamps."""
+
+    kind: Literal["custom"] = "custom"
+    type: str = Field(max_length=200, description="what the action is, for other programs")
+
+
 GlobalAction = Annotated[
     AddEntityAction
     | DeleteEntityAction
     | SignalStateAction
     | SignalPhaseAction
-    | SetVariableAction,
+    | SetVariableAction
+    | CustomAction,
     Field(discriminator="kind"),
 ]
 """Actions without an entity."""
@@ -528,6 +536,7 @@ AnyAction = Annotated[
     | DeleteEntityAction
     | SignalStateAction
     | SignalPhaseAction
-    | SetVariableAction,
+    | SetVariableAction
+    | CustomAction,
     Field(discriminator="kind"),
 ]

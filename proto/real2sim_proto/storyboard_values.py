@@ -114,6 +114,14 @@ def _parameter(name: str, parameters: Mapping[str, Any]) -> Any:
     return value
 
 
+def _number_if_possible(value: Any) -> Any:
+    """Numbers may come as text, in parameters of the type string."""
+    try:
+        return float(value) if isinstance(value, str) else value
+    except ValueError:
+        return value
+
+
 class _Reader:
     """Recursive descent over the tokens of one expression."""
 
@@ -205,7 +213,7 @@ class _Reader:
             self._close()
             return value
         if token.startswith("$"):
-            return _parameter(token, self._parameters)
+            return _number_if_possible(_parameter(token, self._parameters))
         if token in _CONSTANTS:
             return _CONSTANTS[token]
         if token in _FUNCTIONS:

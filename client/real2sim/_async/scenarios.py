@@ -264,6 +264,7 @@ class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
         *,
         leave_out: Sequence[str] = (),
         ego: str | None = None,
+        strict: bool = False,
     ) -> StoryboardResult:
         """Use an OpenSCENARIO file as the storyboard of the scenario's sessions.
 
@@ -273,6 +274,7 @@ class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
             path: a file of version 1.0 to 1.3, without catalogs.
             leave_out: names of unsupported elements to ignore.
             ego: entity that is the ego; default: ``Ego``.
+            strict: refuse elements that have no effect, instead of listing them in ``notes``.
 
         Raises:
             InvalidRequestError: not a valid scenario, or an unsupported element, with its name and
@@ -286,7 +288,9 @@ class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
             ([], 2)
         """
         content = await run_blocking(Path(path).read_bytes)
-        call = _requests.read_xosc(self.scenario_id, content, leave_out, ego, self._etag)
+        call = _requests.read_xosc(
+            self.scenario_id, content, leave_out, ego, self._etag, strict=strict
+        )
         result = await self._transport.send(call)
         await self._applied(result)
         return result

@@ -95,6 +95,9 @@ def import_(
         typer.Option("--leave-out", help="Element of the file to ignore; repeatable."),
     ] = None,
     ego: Annotated[str | None, typer.Option(help="Name of the ego entity; default: Ego.")] = None,
+    strict: Annotated[
+        bool, typer.Option("--strict", help="Refuse elements that have no effect on the drive.")
+    ] = False,
     url: Url = DEFAULT_URL,
     token: Token = None,
     timeout: Timeout = 30.0,
@@ -102,7 +105,7 @@ def import_(
     """Use an OpenSCENARIO file in a scenario."""
     with connected(url, token, timeout) as client:
         handle = client.scenarios.get(scenario_id)
-        result = handle.read_xosc(file, leave_out=leave_out or (), ego=ego)
+        result = handle.read_xosc(file, leave_out=leave_out or (), ego=ego, strict=strict)
     typer.echo(f"{file.name} happens in scenario {scenario_id}, revision {result.revision}")
     for note in result.notes:
         typer.echo(f"note: {note}", err=True)

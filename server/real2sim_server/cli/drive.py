@@ -24,6 +24,7 @@ from .common import Follow, JsonFile, command
 if TYPE_CHECKING:
     from real2sim_proto.storyboard import Storyboard
 
+    from ..scenarios.openscenario import ReadOptions
     from ..scene import Scene
     from ..sweeps.episode import Driven
     from ..world.agents import Event
@@ -59,7 +60,13 @@ def run(
         list[str] | None,
         typer.Option("--leave-out", help="Element of the file to ignore; repeatable."),
     ] = None,
+    strict: Annotated[
+        bool, typer.Option("--strict", help="Refuse elements that have no effect on the drive.")
+    ] = False,
     ego: Annotated[str | None, typer.Option(help="Name of the ego entity; default: Ego.")] = None,
+    roads: Annotated[
+        Path | None, typer.Option(help="OpenDRIVE file to use as the road network of the file.")
+    ] = None,
     seconds: Annotated[float, typer.Option(min=0.1, max=3600, help="Maximum duration [s].")] = 30.0,
     speed: Annotated[
         float | None,
@@ -86,14 +93,19 @@ def run(
 ) -> None:
     """Run a scenario file with a planner and report what happened."""
     from ..scenarios.flat_scene import fitted_to_scene
+    from ..scenarios.openscenario import ReadOptions
     from ..sweeps.episode import recording_of
     from ..world.recording import save_recording
 
-    board, road_file, notes = _storyboard(file, values or [], frozenset(leave_out or ()), ego)
+    options = ReadOptions(_parameters(values or []), frozenset(leave_out or ()), ego, strict)
+    board, road_file, notes = _storyboard(file, options)
+    road_file = roads or road_file
     if speed is not None:
         board = _with_speed(board, speed)
     if export is not None:
         _export(board, export)
+    if planner != SCRIPTED and (taken := _ego_actions(board)):
+        notes += (f"the planner drives: {taken} scripted actions of the ego end at once",)
     for note in notes:
         console.print(f"note: {note}", markup=False, highlight=False)
     with contextlib.ExitStack() as stack:
@@ -119,25 +131,39 @@ def run(
     write_json(json, figures)
 
 
-def _storyboard(
-    file: str, values: list[str], leave_out: frozenset[str], ego: str | None
-) -> tuple[Storyboard, Path | None, tuple[str, ...]]:
+def _ego_actions(board: Storyboard) -> int:
+    """Number of actions of the stories that move the ego."""
+    from ..world.storyboard.progress import GLOBAL
+
+    egos = {entity.name for entity in board.entities if entity.kind == "ego"}
+    return sum(
+        not isinstance(action.action, GLOBAL)
+        for story in board.stories
+        for act in story.acts
+        for group in act.groups
+        if egos & set(map(str, group.entities))
+        for maneuver in group.maneuvers
+        for event in maneuver.events
+        for action in event.actions
+    )
+
+
+def _storyboard(file: str, options: ReadOptions) -> tuple[Storyboard, Path | None, tuple[str, ...]]:
     """The named storyboard, its road file, and elements without effect."""
     from real2sim_proto.storyboard import Storyboard
 
     from ..scenarios import ScenarioError
     from ..scenarios.gallery import corner_case
-    from ..scenarios.openscenario import ReadOptions, read_openscenario
+    from ..scenarios.openscenario import read_openscenario
 
-    given = _parameters(values)
     try:
         if file.startswith("gallery:"):
-            return corner_case(file).storyboard(**given), None, ()
+            return corner_case(file).storyboard(**options.parameters), None, ()
         if file.endswith(".json"):
             fields = json_format.loads(Path(file).read_text(encoding="utf-8"))
-            fields["parameters"] = {**fields.get("parameters", {}), **given}
+            fields["parameters"] = {**fields.get("parameters", {}), **options.parameters}
             return Storyboard.model_validate(fields), None, ()
-        found = read_openscenario(Path(file), ReadOptions(given, leave_out, ego))
+        found = read_openscenario(Path(file), options)
     except (ScenarioError, ValueError, OSError) as error:
         raise CommandError(str(error)) from error
     if len(found.cases) > 1:

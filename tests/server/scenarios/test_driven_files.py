@@ -154,7 +154,7 @@ def test_an_empty_start_trigger_starts_at_once_and_is_noted(run, element):
 
     first = 0.0 if element == "event" else 0.51
     assert found.begins("event") == [pytest.approx(first, abs=0.011)]
-    assert "begin at once" in " ".join(found.output.split())
+    assert "starts at once" in " ".join(found.output.split())
 
 
 @pytest.mark.parametrize("rate", [4.0, -4.0])
@@ -277,3 +277,129 @@ def test_nested_declarations_shadow_outer_ones(run):
     found = run(text, seconds=1.0)
 
     assert math.isclose(found.ego[-1].speed, 3.0), found.output
+
+
+IGNORED = {
+    "TrailerHitch": '<TrailerHitch dx="-1"/>',
+    "ObjectController": '<ObjectController name="c"><Controller name="c"/></ObjectController>',
+    "AppearanceAction": """<AppearanceAction><LightStateAction><LightType/></LightStateAction>
+    </AppearanceAction>""",
+    "ActivateControllerAction": '<ActivateControllerAction lateral="true" longitudinal="true"/>',
+    "ControllerAction": """<ControllerAction><AssignControllerAction/>
+    <OverrideControllerValueAction/></ControllerAction>""",
+    "EnvironmentAction": """<EnvironmentAction><Environment name="rain"><Weather/>
+    <RoadCondition frictionScaleFactor="1.0"/></Environment></EnvironmentAction>""",
+    "UserDefinedAction": """<UserDefinedAction><CustomCommandAction type="x">y
+    </CustomCommandAction></UserDefinedAction>""",
+}
+
+
+def with_ignored(tag: str) -> str:
+    """The scenario with an element that has no effect, in the place where files have it."""
+    element = IGNORED[tag]
+    if tag == "TrailerHitch":
+        return scenario(entities=vehicle("Ego") + vehicle("Target", inside=element))
+    if tag == "ObjectController":
+        target = vehicle("Target").replace("</ScenarioObject>", f"{element}</ScenarioObject>")
+        return scenario(entities=vehicle("Ego") + target)
+    holder = {"EnvironmentAction": "GlobalAction", "UserDefinedAction": ""}.get(
+        tag, "PrivateAction"
+    )
+    element = f"<{holder}>{element}</{holder}>" if holder else element
+    return scenario().replace("</Action>", f'</Action><Action name="other">{element}</Action>', 1)
+
+
+@pytest.mark.parametrize("tag", IGNORED)
+def test_an_element_without_effect_is_noted_and_the_drive_stays_the_same(run, tag):
+    text, plain = with_ignored(tag), run(scenario())
+    found = run(text)
+    line = text[: text.index(f"<{tag}")].count("\n") + 1
+
+    assert found.exit_code == 0, found.output
+    noted = " ".join(found.output.split())
+    assert f"note: <{tag}> is ignored:" in noted
+    assert f"(line {line})" in noted
+    drives = [[i.others.centres.tolist() for i in r.recording.instants] for r in (found, plain)]
+    assert drives[0] == drives[1]
+
+
+@pytest.mark.parametrize("tag", IGNORED)
+def test_a_strict_run_refuses_an_element_without_effect(run, tag):
+    found = run(with_ignored(tag), "--strict")
+
+    assert found.exit_code == 1
+    assert f"<{tag}> is not supported" in " ".join(found.output.split())
+
+
+def test_repeated_elements_without_effect_have_one_note_with_their_count(run):
+    hitch = IGNORED["TrailerHitch"]
+    both = vehicle("Ego", inside=hitch) + vehicle("Target", inside=hitch)
+
+    found = run(scenario(entities=both))
+
+    assert " ".join(found.output.split()).count("<TrailerHitch> is ignored") == 1
+    assert "(2 times, line" in " ".join(found.output.split())
+
+
+def test_names_are_labels_and_not_expressions(run):
+    text = scenario().replace('<Condition name="t"', '<Condition name="${speed limit}"')
+
+    assert run(text).begins("event") == [0.51]
+
+
+def test_a_condition_on_a_parameter_without_a_name_never_holds(run):
+    never = """<ConditionGroup><Condition name="criteria" delay="0" conditionEdge="rising">
+    <ByValueCondition><ParameterCondition parameterRef="" value="" rule="lessThan"/>
+    </ByValueCondition></Condition></ConditionGroup>"""
+    found = run(scenario(stop=never), seconds=2.0)
+
+    assert found.figures["seconds"] == pytest.approx(2.0)
+    assert "<ParameterCondition> is ignored" in " ".join(found.output.split())
+
+
+def test_text_parameters_with_numbers_count_as_numbers_in_expressions(run):
+    declared = """<ParameterDeclarations><ParameterDeclaration name="twice" parameterType="string"
+    value="5"/></ParameterDeclarations>"""
+    text = scenario(init=EGO + private("Target", put(lane(-1, 110.0)), speed("${2 * $twice}")))
+    text = text.replace("<CatalogLocations/>", f"{declared}<CatalogLocations/>")
+    others = run(text).recording.instants[0].others
+
+    assert others.velocities[:, 0].max() == pytest.approx(10.0)
+
+
+def test_the_planner_takes_over_from_actions_of_the_ego(run):
+    found = run(scenario(actor="Ego", action=speed(0.0)), planner="idm", seconds=2.0)
+
+    assert found.exit_code == 0, found.output
+    assert "scripted actions of the ego end at once" in " ".join(found.output.split())
+    assert found.ego[-1].speed > 5.0
+
+
+def test_a_distribution_starts_with_its_first_case_that_the_constraints_allow(run, tmp_path):
+    text = scenario(init=EGO + private("Target", put(lane(-1, 110.0)), speed("$v")))
+    declared = """<ParameterDeclarations><ParameterDeclaration name="v" parameterType="double"
+    value="9"><ConstraintGroup><ValueConstraint rule="greaterThan" value="4"/></ConstraintGroup>
+    </ParameterDeclaration></ParameterDeclarations>"""
+    (tmp_path / "template.xosc").write_text(
+        text.replace("<CatalogLocations/>", f"{declared}<CatalogLocations/>")
+    )
+    cases = """<OpenSCENARIO><FileHeader description="a" author="b" revMajor="1" revMinor="3"
+    date="2026-01-01T00:00:00"/><ParameterValueDistribution>
+    <ScenarioFile filepath="template.xosc"/><Deterministic>
+    <DeterministicSingleParameterDistribution parameterName="v"><DistributionRange stepWidth="2">
+    <Range lowerLimit="2" upperLimit="8"/></DistributionRange>
+    </DeterministicSingleParameterDistribution></Deterministic></ParameterValueDistribution>
+    </OpenSCENARIO>"""
+    found = run(cases)
+
+    others = found.recording.instants[0].others
+    assert others.velocities[:, 0].max() == pytest.approx(6.0)
+    assert "2 cases of the distribution are skipped" in " ".join(found.output.split())
+
+
+def test_another_road_network_can_be_given(run, tmp_path):
+    (tmp_path / "mine.xodr").write_text(ROAD)
+    text = scenario().replace('filepath="road.xodr"', 'filepath="Town01"')
+
+    assert run(text).exit_code == 1
+    assert run(text, "--roads", str(tmp_path / "mine.xodr")).exit_code == 0

@@ -25,14 +25,14 @@ def line_of(text, part):
 
 
 def test_an_element_that_is_not_supported_is_refused_by_name_and_line():
-    text = CASE.replace("<LongitudinalAction>", "<AppearanceAction>", 1).replace(
-        "</LongitudinalAction>", "</AppearanceAction>", 1
+    text = CASE.replace("<LongitudinalAction>", "<TrafficAction>", 1).replace(
+        "</LongitudinalAction>", "</TrafficAction>", 1
     )
-    line = line_of(text, "<AppearanceAction>")
+    line = line_of(text, "<TrafficAction>")
 
-    with pytest.raises(ScenarioError, match=f"line {line}: <AppearanceAction> is not supported"):
+    with pytest.raises(ScenarioError, match=f"line {line}: <TrafficAction> is not supported"):
         read(text)
-    assert len(read(text, leave_out=frozenset({"AppearanceAction"})).init) == 1
+    assert len(read(text, leave_out=frozenset({"TrafficAction"})).init) == 1
 
 
 def test_an_attribute_that_is_not_supported_is_refused_by_name_and_line():

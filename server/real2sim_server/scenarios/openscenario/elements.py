@@ -1,7 +1,7 @@
 """Elements of an OpenSCENARIO file with their lines, and a record of the parts that were read.
 
-Every element and attribute must be read. Unread ones are unsupported, and are rejected by name and
-line.
+Every element and attribute must be read, or ignored with a note. The others are unsupported, and
+are refused by name and line.
 """
 
 from __future__ import annotations
@@ -87,6 +87,40 @@ def _atom(text: str) -> str:
     return text if text.startswith(("$", "(")) else f"({text})"
 
 
+class ConstraintError(ScenarioError):
+    """A value of a parameter that the constraints of its declaration do not allow."""
+
+
+class Notes:
+    """Parts of a scenario that are ignored, because they have no effect on the drive.
+
+    Args:
+        strict: refuse such parts instead.
+    """
+
+    def __init__(self, *, strict: bool = False) -> None:
+        self.strict = strict
+        self._lines: dict[str, dict[tuple[str, int], None]] = {}
+
+    def add(self, sentence: str, file: str = "", line: int = 0) -> None:
+        """Note a part of a file, at most once for each line."""
+        self._lines.setdefault(sentence, {})[file, line] = None
+
+    def sentences(self) -> tuple[str, ...]:
+        """One sentence for each kind, with its count and its first lines."""
+        return tuple(s + self._where(list(lines)) for s, lines in self._lines.items())
+
+    @staticmethod
+    def _where(lines: list[tuple[str, int]]) -> str:
+        if not lines[0][1]:
+            return ""
+        several = len({file for file, _ in lines}) > 1
+        shown = [f"{file} {line}" if several else str(line) for file, line in lines[:5]]
+        more = ", ..." if len(lines) > len(shown) else ""
+        count = f"{len(lines)} times, " if len(lines) > 1 else ""
+        return f" ({count}line {', '.join(shown)}{more})"
+
+
 @dataclass(eq=False)
 class Part:
     """An element that is being read, in a file and a scope."""
@@ -94,6 +128,7 @@ class Part:
     raw: RawElement
     file: str
     scope: Scope
+    notes: Notes
 
     @property
     def tag(self) -> str:
@@ -106,17 +141,39 @@ class Part:
 
     def within(self, scope: Scope) -> Part:
         """The same element in another scope."""
-        return Part(self.raw, self.file, scope)
+        return Part(self.raw, self.file, scope, self.notes)
+
+    def ignore(self, reason: str) -> None:
+        """Ignore the element and note why. Raises ScenarioError if notes are strict."""
+        if self.notes.strict:
+            raise self.error(f"<{self.tag}> is not supported: {reason}")
+        read_all(self.raw)
+        self.notes.add(f"<{self.tag}> is ignored: {reason}", self.file, self.raw.line)
+
+    def ignore_attribute(self, name: str, reason: str) -> None:
+        """Ignore an attribute of the element and note why. Raises ScenarioError if strict."""
+        if self.notes.strict:
+            raise self.error(f"{name} of <{self.tag}> is not supported: {reason}")
+        self.raw.read.add(name)
+        self.notes.add(f"{name} of <{self.tag}> is ignored: {reason}", self.file, self.raw.line)
 
     # --- attributes -----------------------------------------------------------------------------
 
     def text(self, name: str, default: str | None = None) -> str:
         """The current value of an attribute."""
-        given = self._given(name, default)
+        given = self.given(name, default)
         value = self._evaluated(name, given)
         if isinstance(value, bool):
             return "true" if value else "false"
         return f"{value:.17g}" if isinstance(value, float) else str(value)
+
+    def label(self, name: str = "name", default: str | None = None) -> str:
+        """A name: the text as it is, or the value of the parameter that it consists of."""
+        given = self.given(name, default)
+        if given.startswith("$"):
+            # Text that begins with $ would be an expression in the storyboard.
+            given = str(self.scope.values.get(given[1:], given)).lstrip("$")
+        return given or (default or "")
 
     def optional(self, name: str) -> str | None:
         """The current value of an attribute; None if it is missing."""
@@ -124,7 +181,7 @@ class Part:
 
     def number(self, name: str, default: float | None = None) -> float | str:
         """A number, or an expression of parameters."""
-        given = self._given(name, None if default is None else repr(default))
+        given = self.given(name, None if default is None else repr(default))
         value = self._evaluated(name, given)
         try:
             number = float(value)
@@ -140,7 +197,7 @@ class Part:
     def magnitude(self, name: str, default: float | None = None) -> float | str:
         """A non-negative time or distance, or an expression of parameters."""
         found = self.number(name, default)
-        value = float(self._evaluated(name, self._given(name, repr(default))))
+        value = float(self._evaluated(name, self.given(name, repr(default))))
         if value < 0:
             raise self.error(f"{name} of <{self.tag}> is {value:g}; it must be 0 or more")
         return found
@@ -151,7 +208,7 @@ class Part:
 
     def integer(self, name: str, default: int | None = None) -> int:
         """The current value of an integer attribute."""
-        value = self._evaluated(name, self._given(name, None if default is None else str(default)))
+        value = self._evaluated(name, self.given(name, None if default is None else str(default)))
         try:
             number = float(value)
         except (TypeError, ValueError):
@@ -162,7 +219,7 @@ class Part:
 
     def flag(self, name: str, default: bool | None = None) -> bool:
         """The current value of a boolean attribute."""
-        given = self._given(name, None if default is None else str(default).lower())
+        given = self.given(name, None if default is None else str(default).lower())
         value = str(self._evaluated(name, given)).lower()
         if value not in {"true", "false", "1", "0"}:
             raise self.error(f"{name} of <{self.tag}> is {value!r}; allowed: true, false")
@@ -178,7 +235,8 @@ class Part:
             )
         return allowed[given]
 
-    def _given(self, name: str, default: str | None) -> str:
+    def given(self, name: str, default: str | None = None) -> str:
+        """An attribute as in the file."""
         self.raw.read.add(name)
         given = self.raw.attributes.get(name, default)
         if given is None:
@@ -231,7 +289,15 @@ class Part:
 
     def _of(self, raw: RawElement) -> Part:
         raw.is_read = True
-        return Part(raw, self.file, self.scope)
+        return Part(raw, self.file, self.scope, self.notes)
+
+
+def read_all(raw: RawElement) -> None:
+    """Mark an element and everything in it as read."""
+    raw.is_read = True
+    raw.read.update(raw.attributes)
+    for child in raw.children:
+        read_all(child)
 
 
 def unread(raw: RawElement, file: str) -> Iterator[ScenarioError]:
@@ -245,7 +311,7 @@ def unread(raw: RawElement, file: str) -> Iterator[ScenarioError]:
         if child.tag in WITHOUT_EFFECT:
             continue
         if not child.is_read:
-            yield Part(child, file, Scope({}, {})).refused()
+            yield Part(child, file, Scope({}, {}), Notes()).refused()
         else:
             yield from unread(child, file)
 
@@ -414,17 +480,17 @@ KINDS = {name: name for name in (*NUMBERS, "string", "boolean", "dateTime")}
 
 def scoped(part: Part) -> Part:
     """An element in the scope of its parameter declarations; inner names take precedence."""
-    declarations = part.find("ParameterDeclarations")
-    return part if declarations is None else part.within(declared(declarations, {}, {}))
+    return part.within(declared(part, {}, {}))
 
 
-def declared(part: Part | None, texts: Mapping[str, str], values: Mapping[str, Any]) -> Scope:
-    """The scope of declarations below the top level, within the outer scope: a parameter has its
-    assigned value, or its default.
+def declared(part: Part, texts: Mapping[str, str], values: Mapping[str, Any]) -> Scope:
+    """The scope of an element below the top level: that around it, and its own declarations. A
+    parameter has its assigned value, or its default.
     """
-    scope = Scope({}, {}) if part is None else Scope(part.scope.texts, part.scope.values)
-    for each in part.children("ParameterDeclaration") if part is not None else []:
-        name, kind = each.text("name"), each.choice("parameterType", KINDS)
+    scope = Scope(part.scope.texts, part.scope.values)
+    declarations = part.find("ParameterDeclarations")
+    for each in declarations.children("ParameterDeclaration") if declarations is not None else []:
+        name, kind = declared_name(each), each.choice("parameterType", KINDS)
         own = each.within(scope)
         own.text("value")
         given = own.raw.attributes["value"].strip()
@@ -452,7 +518,7 @@ def top_level(part: Part | None, given: Mapping[str, Any]) -> tuple[Scope, dict[
     scope, parameters = Scope({}, {}), dict[str, Any]()
     declarations = part.children("ParameterDeclaration") if part is not None else []
     for each in declarations:
-        name, kind = each.text("name"), each.choice("parameterType", KINDS)
+        name, kind = declared_name(each), each.choice("parameterType", KINDS)
         own = each.within(scope)
         text = own.raw.attributes.get("value", "")
         value = typed(each, own.text("value"), kind)
@@ -473,6 +539,11 @@ def top_level(part: Part | None, given: Mapping[str, Any]) -> tuple[Scope, dict[
         where = part.file if part is not None else "the scenario"
         raise ValueError(f"{where} has no parameter {unknown[0]!r}; there are: {names}")
     return scope, parameters
+
+
+def declared_name(part: Part, attribute: str = "name") -> str:
+    """The name of a parameter; some files write it with a leading ``$``."""
+    return part.given(attribute).removeprefix("$")
 
 
 def typed(part: Part, value: Any, kind: str) -> Any:
@@ -497,7 +568,8 @@ def check_constraints(part: Part, name: str, value: Any) -> None:
         for g in groups
     ]
     if not any(kept):
-        raise part.error(f"parameter {name!r} is {value!r}, which its constraints do not allow")
+        message = f"parameter {name!r} is {value!r}, which its constraints do not allow"
+        raise ConstraintError(str(part.error(message)))
 
 
 def _holds(value: Any, rule: str, text: str) -> bool:

@@ -17,6 +17,8 @@ from .elements import (
     SIDES,
     STATES,
     Part,
+    declared_name,
+    read_all,
     scoped,
 )
 
@@ -33,7 +35,7 @@ class Positions:
     """Reads positions; ``entry`` looks up catalog entries."""
 
     def __init__(self, entry: Resolve) -> None:
-        self._entry = entry
+        self.entry = entry
 
     def position(self, part: Part) -> Fields:
         """The position in an element."""
@@ -45,12 +47,12 @@ class Positions:
         """Fields of ``RouteRef`` or ``AssignRouteAction``: an inline route, or a catalog entry."""
         found = part.only({"Route", "CatalogReference"})
         is_named = found.tag == "CatalogReference"
-        found = self._entry(found, "Route") if is_named else scoped(found)
+        found = self.entry(found, "Route") if is_named else scoped(found)
         points = found.children("Waypoint")
         for point in points:
             point.optional("routeStrategy")
         return {
-            "name": found.text("name", "route"),
+            "name": found.label("name", "route"),
             "closed": found.flag("closed", False),
             "waypoints": [self.position(p.child("Position")) for p in points],
         }
@@ -59,10 +61,10 @@ class Positions:
         """Fields of ``TrajectoryRef``: name, closed and curve."""
         found = part.only({"Trajectory", "CatalogReference"})
         is_named = found.tag == "CatalogReference"
-        found = self._entry(found, "Trajectory") if is_named else scoped(found)
+        found = self.entry(found, "Trajectory") if is_named else scoped(found)
         shape = found.child("Shape").only(_SHAPES)
         return {
-            "name": found.text("name", "trajectory"),
+            "name": found.label("name", "trajectory"),
             "closed": found.flag("closed", False),
             "curve": _SHAPES[shape.tag](self, shape),
         }
@@ -85,7 +87,7 @@ class Positions:
         }  # fmt: skip
 
     def _relative(self, part: Part) -> Fields:
-        _flat(part, "dz")
+        _flat(part, "dz")  # objects stand on the ground
         kind = "relative_world" if part.tag == "RelativeWorldPosition" else "relative_object"
         return _with(
             {
@@ -121,7 +123,7 @@ class Positions:
         fields = {
             "kind": "relative_lane", "entity": part.text("entityRef"),
             "lanes": part.integer("dLane"), "along": along,
-            "ds": part.number("dsLane" if along == "lane" else "ds"),
+            "ds": part.number("dsLane" if along == "lane" else "ds", 0.0),
             "offset": part.number("offset", 0.0),
         }  # fmt: skip
         return _with(fields, self._orientation(part))
@@ -202,14 +204,14 @@ def _with(fields: Fields, orientation: Fields | None) -> Fields:
 
 
 def _level(part: Part) -> None:
-    """Objects are level: other angles are rejected."""
+    """Objects are level: other angles are ignored."""
     for name in ("p", "r"):
         _flat(part, name)
 
 
 def _flat(part: Part, name: str) -> None:
     if name in part.raw.attributes and part.number(name) != 0.0:
-        raise part.error(f"{name} of <{part.tag}> must be 0: objects stay level")
+        part.ignore_attribute(name, "objects stand level on the ground")
 
 
 _POSITIONS: dict[str, Callable[[Positions, Part], Fields]] = {
@@ -252,6 +254,10 @@ def plain_value(text: str) -> bool | float | str:
         return text
 
 
+NEVER: Fields = {"kind": "simulation_time", "rule": "less_than", "value": -1.0}
+"""A condition that never holds."""
+
+
 class Conditions:
     """Reads triggers; ``positions`` reads their positions."""
 
@@ -281,7 +287,7 @@ class Conditions:
                 "entities": [e.text("entityRef") for e in who.children("EntityRef")],
                 "of": who.choice("triggeringEntitiesRule", {"any": "any", "all": "all"}),
             }
-        return {"name": part.text("name", ""), "edge": edge, "delay": delay, "test": test}
+        return {"name": part.label("name", ""), "edge": edge, "delay": delay, "test": test}
 
     # --- of values ------------------------------------------------------------------------------
 
@@ -297,10 +303,17 @@ class Conditions:
         }
 
     def _variable(self, part: Part) -> Fields:
-        name = "variableRef" if part.tag == "VariableCondition" else "parameterRef"
+        name = declared_name(
+            part, "variableRef" if part.tag == "VariableCondition" else "parameterRef"
+        )
+        if not name:
+            part.ignore("a condition on a parameter without a name never holds")
+            return NEVER
         value = plain_value(part.text("value"))
-        rule = part.choice("rule", RULES)
-        return {"kind": "variable", "variable": part.text(name), "rule": rule, "value": value}
+        return {
+            "kind": "variable", "variable": name, "rule": part.choice("rule", RULES),
+            "value": value,
+        }  # fmt: skip
 
     def _signal(self, part: Part) -> Fields:
         return signal_state(part)
@@ -444,9 +457,15 @@ class Actions:
 
     def action(self, part: Part) -> list[Fields]:
         """The action of an event's ``Action``, of ``PrivateAction`` or ``GlobalAction``."""
+        if not part.children():
+            part.ignore("it is empty")
+            return [{"kind": "custom", "type": part.tag}]
         found = part.only(None)
         while found.tag in _NESTED:
             found = found.only(None)
+        if found.tag in _WITHOUT_EFFECT:
+            found.ignore(_WITHOUT_EFFECT[found.tag])
+            return [{"kind": "custom", "type": found.tag}]
         if found.tag not in _ACTIONS:
             raise found.refused(_ACTIONS)
         fields = _ACTIONS[found.tag](self, found)
@@ -519,10 +538,11 @@ class Actions:
         if target.tag == "RelativeTargetLaneOffset":
             fields["relative_to"] = target.text("entityRef")
         if fields["shape"] == "linear" and fields["acceleration"] is not None:
-            raise how.error(
-                "a linear <LaneOffsetAction> has no highest acceleration that is finite; take "
-                "sinusoidal or cubic"
+            how.ignore_attribute(
+                "dynamicsShape",
+                "a linear change of the offset with a largest lateral acceleration is sinusoidal",
             )
+            fields["shape"] = "sinusoidal"
         return fields
 
     def _lateral_distance(self, part: Part) -> Fields:
@@ -600,20 +620,25 @@ class Actions:
         return {"kind": "teleport", "position": self._positions.position(part.child("Position"))}
 
     def _visibility(self, part: Part) -> Fields:
-        shown = {part.flag("graphics"), part.flag("sensors"), part.flag("traffic")}
-        if len(shown) > 1:
-            raise part.error(
-                "<VisibilityAction> is supported with graphics, sensors and traffic alike"
-            )
-        return {"kind": "visibility", "visible": shown.pop()}
-
-    def _activate(self, part: Part) -> Fields:
-        if part.flag("lateral", False):
-            raise part.error("<ActivateControllerAction> is supported for the longitudinal domain")
-        part.optional("controllerRef")
-        return {"kind": "controller", "active": part.flag("longitudinal", False)}
+        visible = part.flag("sensors")
+        for name in ("graphics", "traffic"):
+            if part.flag(name) != visible:
+                part.ignore_attribute(name, "images and traffic see what sensors see")
+        return {"kind": "visibility", "visible": visible}
 
     # --- global ---------------------------------------------------------------------------------
+
+    def _environment(self, part: Part) -> Fields:
+        """Weather has no effect, except for a friction other than 1, which is refused."""
+        found = part.only({"Environment", "CatalogReference"})
+        is_named = found.tag == "CatalogReference"
+        found = self._positions.entry(found, "Environment") if is_named else scoped(found)
+        road = found.find("RoadCondition")
+        if road is not None and road.number("frictionScaleFactor", 1.0) != 1.0:
+            raise road.error("frictionScaleFactor must be 1")
+        part.ignore("images show the scene in its own weather and light")
+        read_all(found.raw)
+        return {"kind": "custom", "type": part.tag}
 
     def _entity(self, part: Part) -> Fields:
         entity = part.text("entityRef")
@@ -630,7 +655,8 @@ class Actions:
         return signal_phase(part)
 
     def _variable(self, part: Part) -> Fields:
-        name = part.optional("variableRef") or part.text("parameterRef")
+        new = "variableRef" in part.raw.attributes
+        name = declared_name(part, "variableRef" if new else "parameterRef")
         what = part.only({"SetAction", "ModifyAction"})
         fields: Fields = {"kind": "set_variable", "variable": name}
         if what.tag == "SetAction":
@@ -668,15 +694,29 @@ def _inline(part: Part) -> Part:
     """A trajectory of version 1.0, defined directly in the action."""
     kept = [c for c in part.raw.children if c.tag in {"Trajectory", "CatalogReference"}]
     holder = type(part.raw)(part.tag, part.raw.line, {}, kept)
-    return Part(holder, part.file, part.scope)
+    return Part(holder, part.file, part.scope, part.notes)
 
 
 _NESTED = frozenset(
     {
         "PrivateAction", "GlobalAction", "LongitudinalAction", "LateralAction", "RoutingAction",
-        "ControllerAction", "InfrastructureAction", "TrafficSignalAction",
+        "InfrastructureAction", "TrafficSignalAction",
     }
 )  # fmt: skip
+CONTROLLERS = (
+    "the planner drives the ego, and the actions of the file move all others; controllers of other "
+    "programs do not run"
+)
+_WITHOUT_EFFECT = {
+    "ControllerAction": CONTROLLERS,
+    "ActivateControllerAction": CONTROLLERS,
+    "AssignControllerAction": CONTROLLERS,
+    "OverrideControllerValueAction": CONTROLLERS,
+    "AppearanceAction": "lamps and animations are not shown",
+    "TrailerAction": "trailers are not simulated",
+    "UserDefinedAction": "it is for another program",
+}
+"""Actions that do not change the drive, and why."""
 _ACTIONS: dict[str, Any] = {
     "SpeedAction": Actions._speed,
     "SpeedProfileAction": Actions._speed_profile,
@@ -690,8 +730,8 @@ _ACTIONS: dict[str, Any] = {
     "AcquirePositionAction": Actions._acquire_position,
     "TeleportAction": Actions._teleport,
     "VisibilityAction": Actions._visibility,
-    "ActivateControllerAction": Actions._activate,
     "EntityAction": Actions._entity,
+    "EnvironmentAction": Actions._environment,
     "TrafficSignalStateAction": Actions._signal_state,
     "TrafficSignalControllerAction": Actions._signal_phase,
     "VariableAction": Actions._variable,

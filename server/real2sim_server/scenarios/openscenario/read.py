@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -18,16 +18,27 @@ from .elements import (
     PEDESTRIANS,
     PRIORITIES,
     VEHICLES,
+    ConstraintError,
+    Notes,
     Part,
     RawElement,
     Scope,
     declared,
+    declared_name,
+    read_all,
     read_elements,
     scoped,
     top_level,
     unread,
 )
-from .parts import Actions, Conditions, Fields, Positions, plain_value
+from .parts import (
+    CONTROLLERS,
+    Actions,
+    Conditions,
+    Fields,
+    Positions,
+    plain_value,
+)
 
 # --- Catalogs ------------------------------------------------------------------------------------
 
@@ -83,21 +94,24 @@ class Catalogs:
         raw.is_read = True
         assigned = part.find("ParameterAssignments")
         given = {
-            a.text("parameterRef"): a.raw.attributes["value"]
+            declared_name(a, "parameterRef"): a.raw.attributes["value"]
             for a in (assigned.children("ParameterAssignment") if assigned is not None else [])
             if a.text("value") is not None
         }
         texts = {name: part.scope.expression(text) for name, text in given.items()}
         values = {name: part.scope.value(text) for name, text in given.items()}
-        entry = Part(raw, file, Scope({}, {}))
-        return entry.within(declared(entry.find("ParameterDeclarations"), texts, values))
+        # Files of the field use parameters of the scenario in catalogs, too; own ones win.
+        entry = Part(raw, file, part.scope, part.notes)
+        return entry.within(declared(entry, texts, values))
 
     def _files(self, part: Part, path: str) -> list[Path]:
         if self._folder is None:
-            raise part.error(f"catalogs in {path!r} cannot be read: the file came alone")
-        folder = (self._folder / path).resolve()
+            part.ignore(f"the file came without its catalogs {path!r}")
+            return []
+        folder = (self._folder / path.replace("\\", "/")).resolve()
         if not folder.is_dir():
-            raise part.error(f"no catalog folder {path!r} next to the scenario file")
+            part.ignore(f"there is no catalog folder {path!r} next to the scenario file")
+            return []
         files = sorted(folder.glob("*.xosc"))
         if len(files) > MAX_FILES:
             raise part.error(f"folder {path!r} holds more than {MAX_FILES} catalogs")
@@ -117,7 +131,7 @@ class Catalogs:
 
 # --- Distributions -------------------------------------------------------------------------------
 
-MAX_CASES = 1_000_000
+MAX_CASES, MAX_SKIPPED = 1_000_000, 1000
 
 
 def read_distributions(part: Part) -> tuple[list[dict[str, Any]], Fields]:
@@ -135,7 +149,8 @@ def read_distributions(part: Part) -> tuple[list[dict[str, Any]], Fields]:
     stochastic.optional("numberOfTestRuns")
     stochastic.optional("randomSeed")
     return [], {
-        d.text("parameterName"): _drawn(d) for d in stochastic.children("StochasticDistribution")
+        declared_name(d, "parameterName"): _drawn(d)
+        for d in stochastic.children("StochasticDistribution")
     }
 
 
@@ -143,14 +158,14 @@ def _cases(part: Part) -> list[dict[str, Any]]:
     axes: list[list[dict[str, Any]]] = []
     for each in part.children():
         if each.tag == "DeterministicSingleParameterDistribution":
-            name = each.text("parameterName")
+            name = declared_name(each, "parameterName")
             axes.append([{name: value} for value in _values(each)])
         elif each.tag == "DeterministicMultiParameterDistribution":
             sets = each.child("ValueSetDistribution").children("ParameterValueSet")
             axes.append(
                 [
                     {
-                        a.text("parameterRef"): plain_value(a.text("value"))
+                        declared_name(a, "parameterRef"): plain_value(a.text("value"))
                         for a in s.children("ParameterAssignment")
                     }
                     for s in sets
@@ -240,11 +255,13 @@ class ReadOptions:
         parameters: values that override the file's.
         leave_out: names of unsupported elements to ignore.
         ego: name of the ego entity; None: the one with an ego's name.
+        strict: refuse elements without effect instead of noting them.
     """
 
     parameters: Mapping[str, Any] = field(default_factory=dict)
     leave_out: frozenset[str] = frozenset()
     ego: str | None = None
+    strict: bool = False
 
 
 def read_openscenario(path: Path, options: ReadOptions | None = None) -> ScenarioFile:
@@ -262,7 +279,7 @@ def read_openscenario(path: Path, options: ReadOptions | None = None) -> Scenari
     except OSError as error:
         raise ScenarioError(f"{path}: cannot be read ({error.strerror})") from error
     root = read_elements(data, path.name, options.leave_out)
-    whole = Part(root, path.name, Scope({}, {}))
+    whole = Part(root, path.name, Scope({}, {}), Notes(strict=options.strict))
     distribution = whole.find("ParameterValueDistribution")
     if distribution is None:
         return _read(root, path.name, path.parent.resolve(), options)
@@ -270,13 +287,32 @@ def read_openscenario(path: Path, options: ReadOptions | None = None) -> Scenari
     target = distribution.child("ScenarioFile").text("filepath")
     cases, drawn = read_distributions(distribution)
     _refuse_unread(root, path.name)
-    first = {**(cases[0] if cases else {}), **options.parameters}
-    found = read_openscenario(path.parent / target, replace(options, parameters=first))
+    found = _first_allowed(path.parent / target, cases, options)
     board = found.board
     if drawn:
         fields = board.model_dump() | {"distributions": drawn}
         board = _validated(fields, path.name)
     return replace(found, board=board, cases=tuple(cases))
+
+
+def _first_allowed(
+    path: Path, cases: Sequence[Mapping[str, Any]], options: ReadOptions
+) -> ScenarioFile:
+    """The scenario with the first case that the constraints of its parameters allow."""
+    for skipped, case in enumerate(cases or [{}]):
+        given = replace(options, parameters={**case, **options.parameters})
+        try:
+            found = read_openscenario(path, given)
+        except ConstraintError as error:
+            if skipped + 1 >= min(len(cases), MAX_SKIPPED):
+                raise
+            reason = str(error)
+            continue
+        if not skipped:
+            return found
+        note = f"{skipped} cases of the distribution are skipped: {reason}"
+        return replace(found, notes=(*found.notes, note))
+    raise AssertionError
 
 
 def read_openscenario_text(
@@ -290,7 +326,7 @@ def read_openscenario_text(
 def _read(root: RawElement, file: str, folder: Path | None, options: ReadOptions) -> ScenarioFile:
     if root.tag != "OpenSCENARIO":
         raise ScenarioError(f"{file}: its root is <{root.tag}>, expected <OpenSCENARIO>")
-    whole = Part(root, file, Scope({}, {}))
+    whole = Part(root, file, Scope({}, {}), Notes(strict=options.strict))
     header = _header(whole)
     declarations = whole.find("ParameterDeclarations")
     try:
@@ -304,7 +340,7 @@ def _read(root: RawElement, file: str, folder: Path | None, options: ReadOptions
     _refuse_unread(root, file)
     for raw, name in reader.catalogs.used:
         _refuse_unread(raw, name)
-    return ScenarioFile(_validated(fields, file), reader.road_file, tuple(reader.notes))
+    return ScenarioFile(_validated(fields, file), reader.road_file, whole.notes.sentences())
 
 
 def _refuse_unread(root: RawElement, file: str) -> None:
@@ -341,8 +377,7 @@ class _Reader:
         self.catalogs = Catalogs(folder, options.leave_out)
         positions = Positions(self.catalogs.entry)
         self._actions, self._conditions = Actions(positions), Conditions(positions)
-        self.notes, self.road_file = list[str](), None
-        self._at_once = list[int]()
+        self._notes, self.road_file = whole.notes, None
 
     road_file: Path | None
 
@@ -359,13 +394,6 @@ class _Reader:
         # The element is required; without a condition it has no effect.
         stop = stop if stop is not None and stop["groups"] else None
         stories = [self._story(s) for s in board.children("Story")]
-        if self._at_once:
-            lines = ", ".join(map(str, self._at_once[:5]))
-            more = ", ..." if len(self._at_once) > 5 else ""
-            self.notes.append(
-                f"{len(self._at_once)} of the acts and events have a start trigger without "
-                f"conditions and begin at once (line {lines}{more})"
-            )
         return {
             **road,
             "variables": self._variables(whole.find("VariableDeclarations")),
@@ -382,7 +410,7 @@ class _Reader:
         for each in part.children("VariableDeclaration") if part is not None else []:
             kind = each.text("variableType")
             value = each.text("value")
-            found[each.text("name")] = value if kind == "string" else plain_value(value)
+            found[each.label()] = value if kind == "string" else plain_value(value)
         return found
 
     # --- roads and signals ----------------------------------------------------------------------
@@ -393,11 +421,11 @@ class _Reader:
         fields: Fields = {}
         logic, picture = part.find("LogicFile"), part.find("SceneGraphFile")
         if picture is not None:
-            picture.text("filepath")
-            self.notes.append("the file's 3D model of the road is not shown")
+            picture.ignore("the file's 3D model of the road is not shown")
         if logic is not None:
             name = logic.text("filepath")
             if name:
+                name = name.replace("\\", "/")
                 fields["roads"] = {"kind": "map", "file": name}
                 self.road_file = (self._folder / name).resolve() if self._folder else None
         signals = part.find("TrafficSignals")
@@ -420,12 +448,12 @@ class _Reader:
             }
             phases.append(
                 {
-                    "name": phase.text("name"), "duration": phase.magnitude("duration"),
+                    "name": phase.label(), "duration": phase.magnitude("duration"),
                     "states": states,
                 }
             )  # fmt: skip
         return {
-            "name": part.text("name"), "delay": part.number("delay", 0.0),
+            "name": part.label(), "delay": part.number("delay", 0.0),
             "reference": part.optional("reference"), "phases": phases,
         }  # fmt: skip
 
@@ -433,7 +461,7 @@ class _Reader:
 
     def _entities(self, part: Part) -> list[Fields]:
         objects = part.children("ScenarioObject")
-        names = [o.text("name") for o in objects]
+        names = [o.label() for o in objects]
         ego = self._ego_of(names, part)
         return [self._entity(o, name, ego) for o, name in zip(objects, names, strict=True)]
 
@@ -444,7 +472,7 @@ class _Reader:
         called = [n for n in names if n.lower() in EGO_NAMES]
         found = wanted or (called[0] if called else None)
         if found is None:
-            self.notes.append("no entity is the ego; the planner drives as it was recorded")
+            self._notes.add("no entity is the ego; the planner drives as it was recorded")
         return found
 
     def _entity(self, part: Part, name: str, ego: str | None) -> Fields:
@@ -459,7 +487,7 @@ class _Reader:
         fields: Fields = {
             "name": name,
             "kind": "ego" if name == ego else "new",
-            "model": model.text("name", ""),
+            "model": model.label("name", ""),
             "box": {"size": size, "centre": centre},
         }
         model.optional("model3d")
@@ -483,19 +511,19 @@ class _Reader:
 
     def _object_controllers(self, part: Part, name: str, ego: str | None) -> None:
         for each in part.children("ObjectController"):
-            if name != ego:
-                raise each.error(
-                    f"<ObjectController> of {name!r} is not supported: entities are moved by the "
-                    "storyboard's actions. Leave it out of the file, or name it in `leave_out`"
-                )
-            _read_all(each.raw)
-            self.notes.append(f"the controller of {name!r} is the planner")
+            if name == ego:
+                read_all(each.raw)
+                self._notes.add(f"the controller of {name!r} is the planner")
+            else:
+                each.ignore(CONTROLLERS)
 
     def _vehicle(self, part: Part) -> Fields:
         performance = part.child("Performance")
         part.optional("role")
-        axles = part.child("Axles")
-        _read_all(axles.raw)
+        if (axles := part.find("Axles")) is not None:
+            read_all(axles.raw)
+        for trailer in part.children("TrailerHitch", "TrailerCoupler", "Trailer"):
+            trailer.ignore("trailers are not simulated")
         for name in ("maxAccelerationRate", "maxDecelerationRate"):
             performance.optional(name)
         return {
@@ -512,38 +540,27 @@ class _Reader:
         actions = part.child("Actions")
         global_init = list[Fields]()
         for action in actions.children("GlobalAction"):
-            if (environment := action.find("EnvironmentAction")) is not None:
-                self._environment(environment)
-                continue
-            global_init += self._actions.action(action)
+            global_init += _with_effect(self._actions.action(action))
         init = list[Fields]()
+        for custom in actions.children("UserDefinedAction"):
+            custom.ignore("it is for another program")
         for private in actions.children("Private"):
             entity = private.text("entityRef")
             for action in private.children("PrivateAction"):
-                init += [{"entity": entity, "action": a} for a in self._actions.action(action)]
+                found = _with_effect(self._actions.action(action))
+                init += [{"entity": entity, "action": a} for a in found]
         return init, global_init
-
-    def _environment(self, part: Part) -> None:
-        """Weather has no effect except friction, which is rejected if it is not 1."""
-        found = part.only({"Environment", "CatalogReference"})
-        is_named = found.tag == "CatalogReference"
-        found = self.catalogs.entry(found, "Environment") if is_named else scoped(found)
-        road = found.find("RoadCondition")
-        if road is not None and road.number("frictionScaleFactor", 1.0) != 1.0:
-            raise road.error("frictionScaleFactor must be 1")
-        _read_all(found.raw)
-        self.notes.append(
-            f"environment {found.text('name', '')!r}: images show the scene in its own weather and "
-            "light"
-        )
 
     def _story(self, part: Part) -> Fields:
         part = scoped(part)
-        return {"name": part.text("name"), "acts": [self._act(a) for a in part.children("Act")]}
+        return {
+            "name": part.label(default="story"),
+            "acts": [self._act(a) for a in part.children("Act")],
+        }
 
     def _act(self, part: Part) -> Fields:
         return {
-            "name": part.text("name"),
+            "name": part.label(default="act"),
             "groups": [self._group(g) for g in part.children("ManeuverGroup")],
             "start": self._start(part),
             "stop": self._conditions.trigger(part.find("StopTrigger")),
@@ -554,7 +571,11 @@ class _Reader:
         start = self._conditions.trigger(part.find("StartTrigger"))
         if start is None or start["groups"]:
             return start
-        self._at_once.append(part.raw.line)
+        self._notes.add(
+            "an act or event with a start trigger without conditions starts at once",
+            part.file,
+            part.raw.line,
+        )
         return None
 
     def _group(self, part: Part) -> Fields:
@@ -567,7 +588,7 @@ class _Reader:
             found = self.catalogs.entry(each, "Maneuver") if is_named else scoped(each)
             maneuvers.append(self._maneuver(found))
         return {
-            "name": part.text("name"),
+            "name": part.label(default="group"),
             "entities": [e.text("entityRef") for e in who.children("EntityRef")],
             "times": part.integer("maximumExecutionCount", 1),
             "maneuvers": maneuvers,
@@ -575,22 +596,27 @@ class _Reader:
 
     def _maneuver(self, part: Part) -> Fields:
         return {
-            "name": part.text("name"),
+            "name": part.label(default="maneuver"),
             "events": [self._event(e) for e in part.children("Event")],
         }
 
     def _event(self, part: Part) -> Fields:
         actions = list[Fields]()
         for each in part.children("Action"):
-            name = each.text("name")
+            name = each.label(default="action")
+            # An ignored action keeps its place, because other elements may wait for its end.
             actions += [{"name": name, "action": a} for a in self._actions.action(each)]
         return {
-            "name": part.text("name"),
+            "name": part.label(default="event"),
             "priority": part.choice("priority", PRIORITIES, "override"),
             "times": part.integer("maximumExecutionCount", 1),
             "actions": actions,
             "start": self._start(part),
         }
+
+
+def _with_effect(actions: list[Fields]) -> list[Fields]:
+    return [action for action in actions if action["kind"] != "custom"]
 
 
 def _box(part: Part) -> tuple[list[Any], list[Any]]:
@@ -600,11 +626,3 @@ def _box(part: Part) -> tuple[list[Any], list[Any]]:
         [size.number("length"), size.number("width"), size.number("height")],
         [centre.number("x"), centre.number("y"), centre.number("z")],
     )
-
-
-def _read_all(raw: RawElement) -> None:
-    """Mark an element without effect, or with a note, as read."""
-    raw.is_read = True
-    raw.read.update(raw.attributes)
-    for child in raw.children:
-        _read_all(child)

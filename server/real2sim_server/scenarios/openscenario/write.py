@@ -150,6 +150,8 @@ def _mass(e: Mapping[str, Any], default: float) -> Any:
 def _init(parent: Element, board: Storyboard) -> None:
     actions = _add(_add(parent, "Init"), "Actions")
     for action in board.model_dump()["global_init"]:
+        if action["kind"] == "custom":
+            continue
         _action(_add(actions, "GlobalAction"), action)
     private, last = None, None
     for entry in board.model_dump()["init"]:
@@ -180,8 +182,10 @@ def _group(parent: Element, group: Mapping[str, Any]) -> None:
                         priority=back(PRIORITIES, event["priority"]),
                         maximumExecutionCount=event["times"])  # fmt: skip
             for action in event["actions"]:
-                kind = "GlobalAction" if action["action"]["kind"] in _GLOBAL else "PrivateAction"
-                _action(_add(_add(held, "Action", name=action["name"]), kind), action["action"])
+                inside, kind = _add(held, "Action", name=action["name"]), action["action"]["kind"]
+                if kind != "custom":
+                    inside = _add(inside, "GlobalAction" if kind in _GLOBAL else "PrivateAction")
+                _action(inside, action["action"])
             _trigger(held, "StartTrigger", event["start"])
 
 
@@ -321,6 +325,10 @@ def _signal(parent: Element, a: Mapping[str, Any]) -> None:
              trafficSignalControllerRef=a["controller"])  # fmt: skip
 
 
+def _custom(parent: Element, a: Mapping[str, Any]) -> None:
+    _add(_add(parent, "UserDefinedAction"), "CustomCommandAction", type=a["type"])
+
+
 def _variable(parent: Element, a: Mapping[str, Any]) -> None:
     part = _add(parent, "VariableAction", variableRef=a["variable"])
     if a["rule"] == "set":
@@ -350,6 +358,7 @@ _WRITE = {
     "signal_state": _signal,
     "signal_phase": _signal,
     "set_variable": _variable,
+    "custom": _custom,
 }
 
 

@@ -508,6 +508,9 @@ async def import_xosc(  # noqa: PLR0917, one parameter for each part of the requ
     ego: Annotated[
         str | None, Query(max_length=200, description="name of the ego entity; default: Ego")
     ] = None,
+    strict: Annotated[
+        bool, Query(description="refuse elements without effect instead of noting them")
+    ] = False,
 ) -> Response:
     """Set the storyboard from an OpenSCENARIO 1.0 to 1.3 file without catalogs.
 
@@ -518,7 +521,7 @@ async def import_xosc(  # noqa: PLR0917, one parameter for each part of the requ
         if idempotent.replay:
             return worker.replayed(idempotent.replay)
         view = await worker.scenarios.view(scenario_id)
-        options = ReadOptions(leave_out=frozenset(leave_out or ()), ego=ego)
+        options = ReadOptions(leave_out=frozenset(leave_out or ()), ego=ego, strict=strict)
 
         def read() -> tuple[Storyboard, tuple[str, ...]]:
             found = read_openscenario_text(body, "storyboard.xosc", options)

@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from real2sim_proto import ErrorCode
 from real2sim_proto.storyboard_actions import (
     AddEntityAction,
+    CustomAction,
     DeleteEntityAction,
     SetVariableAction,
     SignalPhaseAction,
     SignalStateAction,
 )
 
-from ..common import WorldError, copy_with
+from ..common import copy_with
 from ..traffic.driver import Surroundings
 from .begin_actions import Beginning, begun
 from .motion import advanced
@@ -40,6 +40,7 @@ GLOBAL = (
     SetVariableAction,
     SignalPhaseAction,
     SignalStateAction,
+    CustomAction,
 )
 
 
@@ -136,7 +137,7 @@ class Progress:
         for action in self._program.board.global_init:
             self._global(action, t_us, elapsed)
         for entry in self._program.init:
-            self._begin_private(entry.entity, entry.action, elapsed, first=True)
+            self._begin_private(entry.entity, entry.action, elapsed)
 
     def pass_instant(self, t_us: int, elapsed: float, *, first: bool) -> None:
         """Start and end elements at an instant."""
@@ -220,8 +221,10 @@ class Progress:
             self._global(action.spec, self._now, self._elapsed)
             return
         for name in action.entities:
-            tokens[name] = self._token
-            self._begin_private(name, action.spec, self._elapsed, where=action.label)
+            # The planner drives an ego that is not scripted; for it, the action ends at once.
+            if self.entities[name].scripted:
+                tokens[name] = self._token
+                self._begin_private(name, action.spec, self._elapsed)
 
     def _end_actions(self, event: Element | None = None) -> None:
         """End actions that no longer move their entities, and the events of these actions."""
@@ -292,16 +295,8 @@ class Progress:
 
     # --- actions --------------------------------------------------------------------------------
 
-    def _begin_private(
-        self, name: str, action: Any, elapsed: float, *, first: bool = False, where: str = "init"
-    ) -> None:
+    def _begin_private(self, name: str, action: Any, elapsed: float) -> None:
         actor = self.entities[name]
-        if not actor.scripted and not first:
-            raise WorldError(
-                ErrorCode.INVALID_REQUEST,
-                f"action {where!r} is of {name!r}, the ego, which the planner drives",
-                hint="let the storyboard drive the ego (drives_ego), or leave the action out",
-            )
         view = self._view(elapsed, first=True)
         at = Beginning(view, self._places(), self._token, self._program.board.version)
         self._token += 1

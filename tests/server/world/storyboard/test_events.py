@@ -7,7 +7,7 @@ import pytest
 
 from real2sim_proto.episode import ResetSpec
 from real2sim_server.edit import ScenarioState
-from real2sim_server.world import World, WorldError
+from real2sim_server.world import World
 
 from .boards import actor, after, board, changes, condition, drive, event, places, speeds
 
@@ -227,12 +227,13 @@ def test_distributions_are_drawn_by_the_seed(make_scene, moving):
     assert drawn(1) == drawn(1) != drawn(2)
 
 
-def test_actions_of_an_ego_that_the_planner_drives_are_refused(run):
-    made = board(event("slow", to_speed(4.0), start=after(1.0)))
+def test_actions_of_an_ego_that_the_planner_drives_end_at_once(run):
+    made = board(event("slow", to_speed(4.0, 2.0), start=after(1.0)))
     made["stories"][0]["acts"][0]["groups"][0]["entities"] = ["Ego"]
+    worlds = run(stories=made["stories"])
 
-    with pytest.raises(WorldError, match="which the planner drives"):
-        run(stories=made["stories"])
+    assert times_of(worlds, "slow", "end") == times_of(worlds, "slow") == [pytest.approx(1.0)]
+    assert worlds[20].motion.speed == pytest.approx(10.0)
 
 
 def test_a_storyboard_may_drive_the_ego(run):
