@@ -106,7 +106,10 @@ class Acceleration(Entities):
 
 
 class Collision(Entities):
-    """Collision with an entity, or with any of a category; None: with any entity."""
+    """Collision with an entity, or with any of a category; None: with any entity.
+
+    The category ``vehicle`` includes cars, vans, trucks, buses, motorcycles and cyclists.
+    """
 
     kind: Literal["collision"] = "collision"
     entity: Reference | None = None

@@ -403,3 +403,35 @@ def test_another_road_network_can_be_given(run, tmp_path):
 
     assert run(text).exit_code == 1
     assert run(text, "--roads", str(tmp_path / "mine.xodr")).exit_code == 0
+
+
+def test_a_collision_with_any_vehicle_includes_trucks(run):
+    hit = """<StartTrigger><ConditionGroup><Condition name="hit" delay="0" conditionEdge="none">
+    <ByEntityCondition><TriggeringEntities triggeringEntitiesRule="any">
+    <EntityRef entityRef="Ego"/></TriggeringEntities><EntityCondition><CollisionCondition>
+    <ByType type="vehicle"/></CollisionCondition></EntityCondition></ByEntityCondition>
+    </Condition></ConditionGroup></StartTrigger>"""
+    truck = vehicle("Target").replace('vehicleCategory="car"', 'vehicleCategory="truck"')
+    init = EGO + private("Target", put(lane(-2, 80.0)), speed(0.0))
+    found = run(scenario(entities=vehicle("Ego") + truck, init=init, event_start=hit))
+
+    # The gap is 30 m between the reference points, less 4.5 m of front and 0.5 m of rear.
+    assert found.begins("event") == [pytest.approx(2.5, abs=0.02)]
+
+
+@pytest.mark.parametrize(
+    ("condition", "starts"),
+    [
+        ('<AngleCondition angleType="pitch" angle="0.1" angleTolerance="0.2"/>', True),
+        ('<AngleCondition angleType="roll" angle="0.3" angleTolerance="0.2"/>', False),
+        ('<SpeedCondition value="1" rule="lessThan" direction="vertical"/>', True),
+        ('<SpeedCondition value="1" rule="greaterThan" direction="vertical"/>', False),
+    ],
+)
+def test_objects_stay_level_in_conditions(run, condition, starts):
+    start = f"""<StartTrigger><ConditionGroup><Condition name="c" delay="0" conditionEdge="none">
+    <ByEntityCondition><TriggeringEntities triggeringEntitiesRule="any">
+    <EntityRef entityRef="Target"/></TriggeringEntities><EntityCondition>{condition}
+    </EntityCondition></ByEntityCondition></Condition></ConditionGroup></StartTrigger>"""
+
+    assert run(scenario(event_start=start), seconds=1.0).begins("event") == [0.0] * starts

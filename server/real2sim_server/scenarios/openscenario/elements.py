@@ -564,7 +564,7 @@ def check_constraints(part: Part, name: str, value: Any) -> None:
     if not groups:
         return
     kept = [
-        all(_holds(value, c.choice("rule", RULES), c.text("value")) for c in g.children())
+        all(holds(value, c.choice("rule", RULES), c.text("value")) for c in g.children())
         for g in groups
     ]
     if not any(kept):
@@ -572,7 +572,8 @@ def check_constraints(part: Part, name: str, value: Any) -> None:
         raise ConstraintError(str(part.error(message)))
 
 
-def _holds(value: Any, rule: str, text: str) -> bool:
+def holds(value: Any, rule: str, text: str) -> bool:
+    """Whether a value meets a rule; numbers are compared as numbers, all else as text."""
     try:
         a: Any = float(value)
         b: Any = float(text)

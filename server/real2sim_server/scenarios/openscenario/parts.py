@@ -18,6 +18,7 @@ from .elements import (
     STATES,
     Part,
     declared_name,
+    holds,
     read_all,
     scoped,
 )
@@ -255,7 +256,8 @@ def plain_value(text: str) -> bool | float | str:
 
 
 NEVER: Fields = {"kind": "simulation_time", "rule": "less_than", "value": -1.0}
-"""A condition that never holds."""
+ALWAYS: Fields = {"kind": "simulation_time", "rule": "greater_than", "value": -1.0}
+"""Conditions that never or always hold."""
 
 
 class Conditions:
@@ -281,12 +283,12 @@ class Conditions:
             test = _BY_VALUE[found.tag](self, found)
         else:
             who = kind.child("TriggeringEntities")
+            entities = [e.text("entityRef") for e in who.children("EntityRef")]
+            of = who.choice("triggeringEntitiesRule", {"any": "any", "all": "all"})
             found = kind.child("EntityCondition").only(_BY_ENTITY)
-            test = {
-                **_BY_ENTITY[found.tag](self, found),
-                "entities": [e.text("entityRef") for e in who.children("EntityRef")],
-                "of": who.choice("triggeringEntitiesRule", {"any": "any", "all": "all"}),
-            }
+            test = _BY_ENTITY[found.tag](self, found)
+            if test["kind"] != "simulation_time":
+                test |= {"entities": entities, "of": of}
         return {"name": part.label("name", ""), "edge": edge, "delay": delay, "test": test}
 
     # --- of values ------------------------------------------------------------------------------
@@ -355,19 +357,20 @@ class Conditions:
         }  # fmt: skip
 
     def _speed(self, part: Part) -> Fields:
-        fields: Fields = {"kind": "speed", **_ruled(part), **_directed(part)}
         if part.tag == "RelativeSpeedCondition":
-            fields["relative_to"] = part.text("entityRef")
-        return fields
+            entity: Fields = {"relative_to": part.text("entityRef")}
+        else:
+            entity = {}
+        return _directed(part, {"kind": "speed", **_ruled(part), **entity})
 
     def _acceleration(self, part: Part) -> Fields:
-        return {"kind": "acceleration", **_ruled(part), **_directed(part)}
+        return _directed(part, {"kind": "acceleration", **_ruled(part)})
 
     def _collision(self, part: Part) -> Fields:
         target = part.only({"EntityRef", "ByType"})
         if target.tag == "EntityRef":
             return {"kind": "collision", "entity": target.text("entityRef")}
-        kind = target.choice("type", {"vehicle": "car", "pedestrian": "pedestrian"})
+        kind = target.choice("type", {"vehicle": "vehicle", "pedestrian": "pedestrian"})
         return {"kind": "collision", "category": kind}
 
     def _traversed(self, part: Part) -> Fields:
@@ -382,16 +385,18 @@ class Conditions:
         return {"kind": kinds[part.tag], "duration": part.magnitude("duration")}
 
     def _angle(self, part: Part) -> Fields:
-        part.choice("angleType", {"heading": "heading"})
+        turned = part.choice("angleType", {"heading": True, "pitch": False, "roll": False})
         systems = {"entity": "entity", "road": "road", "lane": "road", "world": "world"}
         frame = part.choice("coordinateSystem", systems, "world")
         fields: Fields = {"entity": part.text("entityRef")} if "Rel" in part.tag else {}
         if frame == "road" and not fields:
             raise part.error("coordinateSystem of <AngleCondition> is supported as 'world'")
-        return {
-            **fields, "kind": "angle", "angle": part.number("angle"),
-            "tolerance": part.number("angleTolerance"),
-        }  # fmt: skip
+        angle, tolerance = part.number("angle"), part.number("angleTolerance")
+        if not turned:
+            part.ignore_attribute("angleType", "objects stay level, so pitch and roll are 0")
+            level = abs(float(part.text("angle"))) <= float(part.text("angleTolerance"))
+            return ALWAYS if level else NEVER
+        return {**fields, "kind": "angle", "angle": angle, "tolerance": tolerance}
 
 
 def _ruled(part: Part) -> Fields:
@@ -409,11 +414,16 @@ def _measured(part: Part) -> Fields:
     return {"measure": measure, "frame": frame, "freespace": part.flag("freespace", False)}
 
 
-def _directed(part: Part) -> Fields:
-    words = {"longitudinal": "longitudinal", "lateral": "lateral"}
+def _directed(part: Part, fields: Fields) -> Fields:
+    """The condition in a direction, if one is given; nothing moves vertically."""
     if "direction" not in part.raw.attributes:
-        return {}
-    return {"direction": part.choice("direction", words)}
+        return fields
+    words = {"longitudinal": "longitudinal", "lateral": "lateral", "vertical": None}
+    direction = part.choice("direction", words)
+    if direction is not None:
+        return {**fields, "direction": direction}
+    part.ignore_attribute("direction", "nothing moves vertically")
+    return ALWAYS if holds(0.0, fields["rule"], part.text("value")) else NEVER
 
 
 _BY_VALUE: dict[str, Any] = {

@@ -571,7 +571,7 @@ def _others(
         for other in entities.values()
         if other is not actor
         and other.visible
-        and (category is None or other.category == category)
+        and _is_of(other.category, category)
         and _near(actor, other.x, other.y, other.size[0])
     ]
     known = {a.subject.object_id for a in entities.values() if a.subject is not None}
@@ -580,9 +580,19 @@ def _others(
         x, y, yaw, length, width, _, _ = row
         if subject.object_id in known or not _near(actor, x, y, length):
             continue
-        if category is None or subject.category == category:
+        if _is_of(subject.category, category):
             found.append(box_corners_of(x, y, yaw, length, width))
     return found
+
+
+VEHICLE_CATEGORIES = frozenset({"car", "van", "truck", "bus", "motorcycle", "cyclist"})
+
+
+def _is_of(category: str, wanted: str | None) -> bool:
+    """Whether a category is the wanted one; ``vehicle`` means all vehicles, None anything."""
+    if wanted == "vehicle":
+        return category in VEHICLE_CATEGORIES
+    return wanted is None or category == wanted
 
 
 def _near(actor: EntityState, x: float, y: float, length: float) -> bool:
