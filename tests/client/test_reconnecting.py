@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import pytest
-from real2sim._sync.transport import outlast, reconnect
 
 import real2sim
 from real2sim._session_state import is_away, is_transient
+from real2sim._sync.transport import outlast, reconnect
 from real2sim.errors import ErrorDetails, error_for
 
 
