@@ -77,14 +77,24 @@ def test_an_openscenario_file_round_trips(client, url):
 
 
 def test_an_unsupported_element_is_refused_with_its_line(client, url):
-    text = FILE.decode().replace("LongitudinalAction>", "AppearanceAction>")
-    line = text[: text.index("<AppearanceAction>")].count("\n") + 1
+    text = FILE.decode().replace("LongitudinalAction>", "TrafficAction>")
+    line = text[: text.index("<TrafficAction>")].count("\n") + 1
     refused = client.put(f"{url}/storyboard.xosc", content=text.encode(), headers=XOSC)
     problem = refused.json()
 
     assert problem["code"] == ErrorCode.INVALID_REQUEST
-    assert f"line {line}: <AppearanceAction> is not supported" in problem["detail"]
+    assert f"line {line}: <TrafficAction> is not supported" in problem["detail"]
     assert stored(client, url) is None
+
+
+def test_an_element_without_effect_is_noted_or_refused_if_strict(client, url):
+    text = FILE.decode().replace("LongitudinalAction>", "AppearanceAction>").encode()
+    path = f"{url}/storyboard.xosc"
+    strict = client.put(path, params={"strict": True}, content=text, headers=XOSC)
+    noted = client.put(path, content=text, headers=XOSC)
+
+    assert "<AppearanceAction> is not supported" in strict.json()["detail"]
+    assert any("<AppearanceAction> is ignored" in note for note in noted.json()["notes"])
 
 
 def test_unknown_storyboards_cases_and_parameters_are_refused(client, url):
