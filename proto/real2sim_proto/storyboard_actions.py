@@ -512,8 +512,7 @@ GlobalAction = Annotated[
     | DeleteEntityAction
     | SignalStateAction
     | SignalPhaseAction
-    | SetVariableAction
-    | CustomAction,
+    | SetVariableAction,
     Field(discriminator="kind"),
 ]
 """Actions without an entity."""

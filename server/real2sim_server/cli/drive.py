@@ -65,7 +65,8 @@ def run(
     ] = False,
     ego: Annotated[str | None, typer.Option(help="Name of the ego entity; default: Ego.")] = None,
     roads: Annotated[
-        Path | None, typer.Option(help="OpenDRIVE file to use as the road network of the file.")
+        Path | None,
+        typer.Option(exists=True, help="OpenDRIVE file to use as the road network of the file."),
     ] = None,
     seconds: Annotated[float, typer.Option(min=0.1, max=3600, help="Maximum duration [s].")] = 30.0,
     speed: Annotated[
@@ -92,6 +93,8 @@ def run(
     json: JsonFile = None,
 ) -> None:
     """Run a scenario file with a planner and report what happened."""
+    from real2sim_proto.storyboard import MapRoads
+
     from ..scenarios.flat_scene import fitted_to_scene
     from ..scenarios.openscenario import ReadOptions
     from ..sweeps.episode import recording_of
@@ -99,6 +102,8 @@ def run(
 
     options = ReadOptions(_parameters(values or []), frozenset(leave_out or ()), ego, strict)
     board, road_file, notes = _storyboard(file, options)
+    if roads is not None and not isinstance(board.roads, MapRoads):
+        raise CommandError(f"--roads: {file} names no road network that could be replaced")
     road_file = roads or road_file
     if speed is not None:
         board = _with_speed(board, speed)

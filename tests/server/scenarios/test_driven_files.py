@@ -401,8 +401,12 @@ def test_another_road_network_can_be_given(run, tmp_path):
     (tmp_path / "mine.xodr").write_text(ROAD)
     text = scenario().replace('filepath="road.xodr"', 'filepath="Town01"')
 
+    roads = ("--roads", str(tmp_path / "mine.xodr"))
+    without = text.replace('<RoadNetwork><LogicFile filepath="Town01"/></RoadNetwork>', "")
+
     assert run(text).exit_code == 1
-    assert run(text, "--roads", str(tmp_path / "mine.xodr")).exit_code == 0
+    assert run(text, *roads).exit_code == 0
+    assert "names no road network" in " ".join(run(without, *roads).output.split())
 
 
 def test_a_collision_with_any_vehicle_includes_trucks(run):

@@ -287,7 +287,7 @@ class Conditions:
             of = who.choice("triggeringEntitiesRule", {"any": "any", "all": "all"})
             found = kind.child("EntityCondition").only(_BY_ENTITY)
             test = _BY_ENTITY[found.tag](self, found)
-            if test["kind"] != "simulation_time":
+            if test is not ALWAYS and test is not NEVER:
                 test |= {"entities": entities, "of": of}
         return {"name": part.label("name", ""), "edge": edge, "delay": delay, "test": test}
 
@@ -357,11 +357,10 @@ class Conditions:
         }  # fmt: skip
 
     def _speed(self, part: Part) -> Fields:
+        fields: Fields = {"kind": "speed", **_ruled(part)}
         if part.tag == "RelativeSpeedCondition":
-            entity: Fields = {"relative_to": part.text("entityRef")}
-        else:
-            entity = {}
-        return _directed(part, {"kind": "speed", **_ruled(part), **entity})
+            fields["relative_to"] = part.text("entityRef")
+        return _directed(part, fields)
 
     def _acceleration(self, part: Part) -> Fields:
         return _directed(part, {"kind": "acceleration", **_ruled(part)})

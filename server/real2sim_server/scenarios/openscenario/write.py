@@ -150,8 +150,6 @@ def _mass(e: Mapping[str, Any], default: float) -> Any:
 def _init(parent: Element, board: Storyboard) -> None:
     actions = _add(_add(parent, "Init"), "Actions")
     for action in board.model_dump()["global_init"]:
-        if action["kind"] == "custom":
-            continue
         _action(_add(actions, "GlobalAction"), action)
     private, last = None, None
     for entry in board.model_dump()["init"]:
