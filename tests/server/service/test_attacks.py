@@ -230,6 +230,21 @@ def test_bytes_that_are_not_http_get_a_problem_document(site):
 
 
 @pytest.mark.network
+def test_a_broken_body_is_refused_once_without_a_traceback(site, caplog):
+    request = (
+        b"POST /v1/scenarios HTTP/1.1\r\nHost: 127.0.0.1\r\n"
+        b"Transfer-Encoding: chunked\r\n\r\nno size\r\n"
+    )
+    with opened(site.url) as connection:
+        connection.sendall(request)
+        answer = read_to_end(connection)
+    wait_until(lambda: len(site.worker.connections) == 0, "the connection to end")
+    assert status_of(answer) == 400
+    assert answer.count(b"HTTP/1.1 400") == 1
+    assert [record.message for record in caplog.records] == ["Invalid HTTP request received."]
+
+
+@pytest.mark.network
 def test_an_unsupported_websocket_version_gets_a_problem_document(site):
     request = (
         "GET /v1/scenarios/any/view HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\n"
@@ -479,6 +494,23 @@ def test_invalid_utf8_closes_the_socket_without_a_traceback(site, caplog, text):
         with pytest.raises(ConnectionClosed):
             drive.recv(timeout=LIMIT_S)
         assert drive.close_code == 1007
+    assert caplog.records == []
+
+
+@pytest.mark.network
+def test_invalid_utf8_and_a_close_frame_at_once_log_no_error(site, caplog):
+    with connect(
+        create_session(site)["ws_url"],
+        subprotocols=[DRIVE_SUBPROTOCOL],
+        compression=None,
+        proxy=None,
+    ) as drive:
+        drive.protocol.send_text(b"\xff\xfe")
+        drive.protocol.send_close(1000)
+        drive.socket.sendall(b"".join(drive.protocol.data_to_send()))
+        with pytest.raises(ConnectionClosed):
+            drive.recv(timeout=LIMIT_S)
+    wait_until(lambda: len(site.worker.connections) == 0, "the connection to end")
     assert caplog.records == []
 
 

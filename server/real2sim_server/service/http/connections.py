@@ -25,6 +25,7 @@ import h11
 import structlog
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
+from websockets.exceptions import InvalidState
 
 from real2sim_proto import HTTP_STATUS, PROBLEM_MEDIA_TYPE, ErrorCode
 
@@ -210,6 +211,7 @@ class Connection(asyncio.Protocol):
         self._busy = False
         self._answering = False
         self._refused = False
+        self._lost = asyncio.Event()
 
     # --- events of asyncio --------------------------------------------------------------------
 
@@ -227,6 +229,7 @@ class Connection(asyncio.Protocol):
 
     def connection_lost(self, exc: Exception | None) -> None:
         """The connection has ended."""
+        self._lost.set()
         self._connections.forget(self)
         self._protocol.connection_lost(exc)
 
@@ -244,8 +247,9 @@ class Connection(asyncio.Protocol):
         token = _connection.set(self)
         try:
             self._protocol.data_received(data)
-        except h11.LocalProtocolError:
-            # Bytes after a request in progress are not HTTP; there is no reply to them.
+        except (h11.LocalProtocolError, InvalidState):
+            # There is no reply to bytes after a request in progress that are not HTTP, nor to text
+            # that is not UTF-8 if a close frame follows it.
             self._transport.close()
         finally:
             _connection.reset(token)
@@ -308,6 +312,10 @@ class Connection(asyncio.Protocol):
         async def send_noted(message: Message) -> None:
             nonlocal finished
             self._answering = True
+            if self._transport.is_closing():
+                # uvicorn may have refused the body already. It ignores a reply once the
+                # connection is lost.
+                await self._lost.wait()
             await send(message)
             if message["type"] == "http.response.body" and not message.get("more_body"):
                 finished = True
