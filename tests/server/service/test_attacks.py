@@ -241,7 +241,7 @@ def test_a_broken_body_is_refused_once_without_a_traceback(site, caplog):
     wait_until(lambda: len(site.worker.connections) == 0, "the connection to end")
     assert status_of(answer) == 400
     assert answer.count(b"HTTP/1.1 400") == 1
-    assert [record.message for record in caplog.records] == ["Invalid HTTP request received."]
+    assert not any(record.exc_info for record in caplog.records)
 
 
 @pytest.mark.network
