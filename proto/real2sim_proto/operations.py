@@ -6,14 +6,13 @@ objects, erased regions and colliders share one name space.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, TypeAdapter, field_validator, model_validator
 
 from .base import Identifier, Metres, Microseconds, Model, Pose, Quaternion, Track, Vector3
 from .episode import AgentDriver, IdmDriver
-from .storyboard import Storyboard, stored_storyboard
+from .storyboard import Storyboard
 
 Frame = Literal["world", "object"]
 
@@ -498,16 +497,6 @@ class SetStoryboard(Model):
 
     op: Literal["set_storyboard"] = "set_storyboard"
     storyboard: Storyboard | None = Field(default=None, description="default: none")
-
-
-def stored_operations(stored: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Fields of operations from a log or file, with the meaning they had when they were written."""
-    return [
-        {**each, "storyboard": stored_storyboard(each["storyboard"])}
-        if each.get("op") == "set_storyboard" and isinstance(each.get("storyboard"), Mapping)
-        else dict(each)
-        for each in stored
-    ]
 
 
 def _direction(vector: Vector3, name: str) -> Vector3:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field
 
 from .base import Identifier, Model, Named, one_of
-from .operations import AddCollider, EraseRegion, Operation, stored_operations
+from .operations import AddCollider, EraseRegion, Operation
 from .scenes import ObjectInfo, Reply
 from .storyboard import Storyboard
 from .storyboard_values import Name
@@ -165,18 +165,3 @@ class ScenarioDocument(Reply):
     assets: dict[str, str] = Field(default_factory=dict, description="content hash by asset id")
     entries: list[HistoryEntry] = Field(default_factory=list, max_length=100_000)
     exported_at: str = ""
-
-    @field_validator("entries", mode="before")
-    @classmethod
-    def _as_written(cls, entries: Any) -> Any:
-        if not isinstance(entries, list):
-            return entries
-        return [
-            {**e, "operations": stored_operations(e["operations"])} if _has_operations(e) else e
-            for e in entries
-        ]
-
-
-def _has_operations(entry: Any) -> bool:
-    operations = entry.get("operations") if isinstance(entry, dict) else None
-    return isinstance(operations, list) and all(isinstance(o, dict) for o in operations)

@@ -73,9 +73,9 @@ class Entity(Model):
     )
     model: str = Field(default="", max_length=200, description="name in the file's catalog")
     mass: Value | None = Field(default=None, description="[kg]")
-    max_speed: Value = Field(default=70.0, description="[m/s]")
-    max_acceleration: Value = Field(default=10.0, description="[m/s^2]")
-    max_deceleration: Value = Field(default=10.0, description="[m/s^2]")
+    max_speed: Value = Field(default=70.0, description="limit of its actions [m/s]")
+    max_acceleration: Value = Field(default=10.0, description="limit of its actions [m/s^2]")
+    max_deceleration: Value = Field(default=10.0, description="limit of its actions [m/s^2]")
 
     @model_validator(mode="after")
     def _is_someone(self) -> Entity:
@@ -303,10 +303,6 @@ class Storyboard(Model):
     so is a negative time or distance. Rates use their magnitude.
     """
 
-    version: Literal[1, 2] = Field(
-        default=2,
-        description="version of the execution rules; 1 reproduces recordings without a version",
-    )
     name: str = Field(default="", max_length=200)
     author: str = Field(default="", max_length=200)
     date: str = Field(default="", max_length=40)
@@ -344,9 +340,8 @@ class Storyboard(Model):
     def _names_are_known(self) -> Storyboard:
         _check_names(self)
         board = resolved(self)
-        if self.version >= 2:
-            for part in (board.controllers, board.init, board.stories, board.stop):
-                _check_magnitudes(part, "")
+        for part in (board.controllers, board.init, board.stories, board.stop):
+            _check_magnitudes(part, "")
         return self
 
 
@@ -368,11 +363,6 @@ def resolved(board: Storyboard) -> Storyboard:
 _RESOLVED = (
     "entities", "signals", "controllers", "init", "global_init", "stories", "stop",
 )  # fmt: skip
-
-
-def stored_storyboard(fields: Mapping[str, Any]) -> dict[str, Any]:
-    """Fields of a storyboard from a log or file; without a version number it is version 1."""
-    return {"version": 1, **fields}
 
 
 def element_names(board: Storyboard) -> Iterator[tuple[str, ...]]:
@@ -506,5 +496,4 @@ __all__ = [
     "element_names",
     "entity_references",
     "resolved",
-    "stored_storyboard",
 ]

@@ -18,15 +18,17 @@ Reference = Annotated[str, Field(min_length=1, max_length=200)]
 
 
 class Orientation(Model):
-    """A heading [rad]; a relative one is relative to the frame of the position."""
+    """A heading [rad]; a relative one is relative to the frame of the position.
+
+    The frame of `lane`, and of `relative_lane` with `along` "lane", is the driving direction of the
+    lane; that of other positions on roads is the direction of the reference line.
+    """
 
     h: Value = 0.0
     relative: bool = False
 
 
-DRIVING = Field(
-    default=None, description="None: in driving direction; relative: to the road's direction"
-)
+ALONG = Field(default=None, description="None: relative, with a heading of 0")
 
 
 class WorldPosition(Model):
@@ -66,7 +68,7 @@ class RoadPosition(Model):
     road: str = Field(max_length=80)
     s: Value
     t: Value
-    orientation: Orientation | None = DRIVING
+    orientation: Orientation | None = ALONG
 
 
 class RelativeRoadPosition(Model):
@@ -76,7 +78,7 @@ class RelativeRoadPosition(Model):
     entity: Reference
     ds: Value
     dt: Value
-    orientation: Orientation | None = DRIVING
+    orientation: Orientation | None = ALONG
 
 
 class LanePosition(Model):
@@ -87,7 +89,7 @@ class LanePosition(Model):
     lane: int | Value
     s: Value
     offset: Value = 0.0
-    orientation: Orientation | None = DRIVING
+    orientation: Orientation | None = ALONG
 
 
 class RelativeLanePosition(Model):
@@ -103,7 +105,7 @@ class RelativeLanePosition(Model):
         description="measure `ds` along the centre of its lane, or the reference line",
     )
     offset: Value = 0.0
-    orientation: Orientation | None = DRIVING
+    orientation: Orientation | None = ALONG
 
 
 PlainPosition = (
@@ -137,7 +139,7 @@ class RoutePosition(Model):
         default=None,
         description="lane id at that point; `t` is measured from its centre; None: from the route",
     )
-    orientation: Orientation | None = DRIVING
+    orientation: Orientation | None = ALONG
 
 
 class TrajectoryPosition(Model):
@@ -147,7 +149,7 @@ class TrajectoryPosition(Model):
     curve: Curve
     s: Value
     t: Value = Field(default=0.0, description="positive to the left [m]")
-    orientation: Orientation | None = DRIVING
+    orientation: Orientation | None = ALONG
 
 
 Position = Annotated[
@@ -220,7 +222,7 @@ class LaneChangeAction(Model):
 
 
 class LaneOffsetAction(Model):
-    """Lateral offset from the centre of its lane, or from an entity's offset."""
+    """Lateral offset from the centre of its lane, or from an entity."""
 
     kind: Literal["lane_offset"] = "lane_offset"
     offset: Value = Field(description="positive to the left [m]")

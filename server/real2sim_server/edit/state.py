@@ -15,7 +15,7 @@ from pydantic import TypeAdapter
 from real2sim_proto import CodecError, ErrorCode, decode, encode
 from real2sim_proto.episode import AgentDriver
 from real2sim_proto.operations import AddCollider, EraseRegion, SetGait, SetPhysics, SetVelocity
-from real2sim_proto.storyboard import Storyboard, stored_storyboard
+from real2sim_proto.storyboard import Storyboard
 
 from ..scene import Figure, GaussianCloud, Ground, Scene, Trajectory
 from .tracks import PackedTracks
@@ -300,7 +300,7 @@ def unpack_state(initial: ScenarioState, packed: bytes) -> ScenarioState:
         regions = [EraseRegion.model_validate(r) for r in document["regions"]]
         colliders = [AddCollider.model_validate(c) for c in document["colliders"]]
         story = document.get("story")
-        board = None if story is None else Storyboard.model_validate(stored_storyboard(story))
+        board = None if story is None else Storyboard.model_validate(story)
         tombstones, next_instance_id = frozenset(document["gone"]), document["next_instance_id"]
     except (CodecError, KeyError, TypeError, ValueError) as error:
         raise EditError(

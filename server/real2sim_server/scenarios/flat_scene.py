@@ -143,7 +143,7 @@ def _ego_place(board: Storyboard) -> Any:
 def _axle_ahead(board: Storyboard, scene: Recorded) -> float:
     """Distance from the ego's reference point forward to its rear axle [m]."""
     ego = next((e for e in resolved(board).entities if e.kind == "ego"), None)
-    centre = None if ego is None or board.version < 2 else own_centre(ego, scene.ego_size)
+    centre = None if ego is None else own_centre(ego, scene.ego_size)
     return 0.0 if centre is None else centre[0] - (scene.ego_size[0] / 2 - REAR_OVERHANG)
 
 

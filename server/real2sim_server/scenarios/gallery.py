@@ -414,8 +414,9 @@ def ccfhos() -> Fields:
 )  # fmt: skip
 def ccfhol() -> Fields:
     """Euro NCAP CCFhol: head-on, lane change; here the other car changes lanes."""
-    init = put("overtaken", ahead("${$ahead - 30}", lanes=1), "$slow")
-    init += put("overtaker", ahead("$ahead", lanes=1), "$speed")
+    there = ahead("${$ahead - 30}", lanes=1, orientation=AGAINST)
+    init = put("overtaken", there, "$slow")
+    init += put("overtaker", ahead("$ahead", lanes=1, orientation=AGAINST), "$speed")
     out = event("move_out", near("overtaker", "$distance"), change(0, "Ego", "$duration"))
     entities = [("overtaken", "van", VAN), ("overtaker", "car", CAR)]
     return board(entities, init, overtaker=[out])
@@ -426,7 +427,7 @@ def ccfhol() -> Fields:
 )  # fmt: skip
 def lss_oncoming() -> Fields:
     """Euro NCAP's oncoming vehicle, but drifting."""
-    init = put("oncoming", ahead("$ahead", lanes=1), "$speed")
+    init = put("oncoming", ahead("$ahead", lanes=1, orientation=AGAINST), "$speed")
     how = {"shape": "sinusoidal", "acceleration": 0.8}
     aside = {"kind": "lane_offset", "offset": "$drift", **how}
     return board(
@@ -443,7 +444,7 @@ def ccftap() -> Fields:
 
     By default it is in the middle of the ego's lane when the ego arrives.
     """
-    init = put("turner", ahead("${$ahead + $radius}", lanes=1))
+    init = put("turner", ahead("${$ahead + $radius}", lanes=1, orientation=AGAINST))
     corner = [(0.0, 0.0, 1.0), ("$radius", 0.0, 0.7071067811865476), ("$radius", "$radius", 1.0)]
     quarter = {
         "shape": "nurbs",

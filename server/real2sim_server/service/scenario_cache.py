@@ -22,7 +22,6 @@ from real2sim_proto.operations import (
     Operation,
     Replace,
     Spawn,
-    stored_operations,
 )
 from real2sim_proto.scenarios import HistoryEntry, OperationResult, ScenarioInfo
 
@@ -102,7 +101,7 @@ class StoredOperations(Sequence[Operation]):
 
     @cached_property
     def _models(self) -> list[Operation]:
-        return OPERATIONS.validate_python(stored_operations(self._stored))
+        return OPERATIONS.validate_python(self._stored)
 
 
 def stored_entry(stored: Mapping[str, Any]) -> LogEntry:

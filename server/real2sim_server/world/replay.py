@@ -10,9 +10,8 @@ from pydantic import TypeAdapter
 
 from real2sim_proto import decode, encode
 from real2sim_proto.episode import ResetSpec
-from real2sim_proto.operations import Operation, stored_operations
+from real2sim_proto.operations import Operation
 from real2sim_proto.plans import PLAN, Plan
-from real2sim_proto.storyboard import stored_storyboard
 
 from ..edit import ScenarioState
 from ..scene import Scene
@@ -52,10 +51,7 @@ def stored_spec(fields: Mapping[str, Any]) -> ResetSpec:
     Raises:
         ValueError: invalid spec.
     """
-    completed = _completed(fields, BEFORE)
-    if isinstance(board := completed.get("storyboard"), Mapping):
-        completed["storyboard"] = stored_storyboard(board)
-    spec = ResetSpec.model_validate(completed)
+    spec = ResetSpec.model_validate(_completed(fields, BEFORE))
     if fields.get("horizon") is None:
         # The replay ends with the log, even if the episode could continue.
         return spec.model_copy(update={"horizon": None})
@@ -199,7 +195,7 @@ def _apply_entry(world: World, kind: str, fields: dict[str, Any]) -> None:
                 missed=fields.get("missed", False),
             )
         case "edit":
-            world.apply(_OPERATIONS.validate_python(stored_operations(fields["operations"])))
+            world.apply(_OPERATIONS.validate_python(fields["operations"]))
         case "agent":
             poses = [(x, y, yaw) for x, y, yaw in fields["poses"]]
             world.set_agent_plan(fields["object_id"], fields["times_us"], poses)

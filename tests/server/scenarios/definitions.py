@@ -10,6 +10,8 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple
 
+import numpy as np
+
 EGO_SPEED = 10.0
 LANE = 3.5
 EGO_FRONT, CAR_FRONT, VAN_FRONT, CAR_REAR = 3.65, 3.6, 4.3, 0.9
@@ -46,8 +48,27 @@ def form(t: float, start: float, duration: float) -> float:
     return (1.0 - math.cos(math.pi * u)) / 2
 
 
+def along(t: float, start: float, duration: float, speed: float, width: float) -> float:
+    """Way along the road at a constant speed, of which a part is across it in between."""
+    u = (np.arange(1000) + 0.5) / 1000 * min(max((t - start) / duration, 0.0), 1.0)
+    across = width / 2 * math.pi / duration * np.sin(math.pi * u)
+    changing = min(max(t - start, 0.0), duration)
+    return speed * (t - changing) + float(np.sqrt(speed**2 - across**2).mean()) * changing
+
+
 def steady(x: float, y: float, speed: float, sense: float = 1.0) -> Course:
     return lambda t: (x + sense * speed * t, y, speed)
+
+
+def changing_lane(
+    x: float, start: float, duration: float, speed: float, before: float, after: float,
+    sense: float = 1.0,
+) -> Course:  # fmt: skip
+    def course(t: float) -> tuple[float, float, float]:
+        way = along(t, start, duration, speed, after - before)
+        return x + sense * way, before + (after - before) * form(t, start, duration), speed
+
+    return course
 
 
 # --- ahead ------------------------------------------------------------------------------------
@@ -96,7 +117,7 @@ def cut_in(gap: float, speed: float, duration: float) -> Definition:
     start = (35.0 - EGO_FRONT - CAR_REAR - gap) / (EGO_SPEED - speed)
     return Definition(
         {"move_in": start},
-        {"": lambda t: (35.0 + speed * t, LANE * (1 - form(t, start, duration)), speed)},
+        {"": changing_lane(35.0, start, duration, speed, LANE, 0.0)},
     )
 
 
@@ -105,18 +126,16 @@ def cut_in_brake(gap: float, speed: float, duration: float, braking: float) -> D
     done = start + duration
 
     def course(t: float) -> tuple[float, float, float]:
-        way, v = ramp(t - done, speed, 0.0, braking)
-        return 25.0 + speed * done + way, LANE * (1 - form(t, start, duration)), v
+        way, v = ramp(max(t - done, 0.0), speed, 0.0, braking)
+        way += along(min(t, done), start, duration, speed, LANE)
+        return 25.0 + way, LANE * (1 - form(t, start, duration)), v
 
     return Definition({"move_in": start, "brake": done}, {"": course})
 
 
 def cut_out(gap: float, speed: float, reveal: float) -> Definition:
     start = (80.0 - CAR_REAR - (gap + 6.0) - VAN_FRONT - reveal) / speed
-
-    def leader(t: float) -> tuple[float, float, float]:
-        return gap + 6.0 + speed * t, LANE * form(t, start, 2.0), speed
-
+    leader = changing_lane(gap + 6.0, start, 2.0, speed, 0.0, LANE)
     return Definition({"move_out": start}, {"leader": leader, "standing": steady(80.0, 0.0, 0.0)})
 
 
@@ -127,7 +146,8 @@ def pull_out(
 
     def course(t: float) -> tuple[float, float, float]:
         way, v = ramp(t - start, 0.0, speed, acceleration)
-        return ahead + way, -2.8 * (1 - form(way, 0.0, length)), v
+        x = ahead + along(way, 0.0, length, 1.0, 2.8)
+        return x, -2.8 * (1 - form(way, 0.0, length)), v
 
     return Definition({"pull_out": start}, {"": course})
 
@@ -136,7 +156,7 @@ def lss_overtaking(behind: float, speed: float, duration: float) -> Definition:
     start = (9.0 + behind - 2.5) / (speed - EGO_SPEED)
     return Definition(
         {"come_back": start},
-        {"": lambda t: (speed * t - behind, LANE * (1 - form(t, start, duration)), speed)},
+        {"": changing_lane(-behind, start, duration, speed, LANE, 0.0)},
     )
 
 
@@ -161,11 +181,9 @@ def ccfhol(ahead: float, speed: float, slow: float, distance: float, duration: f
         {"move_out": start},
         {
             "overtaken": steady(ahead - 30.0, LANE, slow, -1.0),
-            "overtaker": lambda t: (
-                ahead - speed * t, LANE * (1 - form(t, start, duration)), speed,
-            ),
+            "overtaker": changing_lane(ahead, start, duration, speed, LANE, 0.0, -1.0),
         },
-    )  # fmt: skip
+    )
 
 
 def lss_oncoming(ahead: float, speed: float, distance: float, drift: float) -> Definition:
@@ -174,7 +192,7 @@ def lss_oncoming(ahead: float, speed: float, distance: float, drift: float) -> D
     duration = math.pi * math.sqrt(drift / (2 * 0.8))
     return Definition(
         {"drift": start},
-        {"": lambda t: (ahead - speed * t, LANE - drift * form(t, start, duration), speed)},
+        {"": changing_lane(ahead, start, duration, speed, LANE, LANE - drift, -1.0)},
     )
 
 

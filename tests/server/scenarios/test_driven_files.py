@@ -21,7 +21,9 @@ DT = 0.1
 ROAD = """<OpenDRIVE><header revMajor="1" revMinor="5"/>
 <road id="1" junction="-1" length="600" rule="RHT"><planView>
 <geometry s="0" x="0" y="0" hdg="0" length="600"><line/></geometry></planView>
-<lanes><laneSection s="0"><center><lane id="0" type="none"/></center><right>
+<lanes><laneSection s="0"><left>
+<lane id="1" type="driving"><width sOffset="0" a="3.5" b="0" c="0" d="0"/></lane></left>
+<center><lane id="0" type="none"/></center><right>
 <lane id="-1" type="driving"><width sOffset="0" a="3.5" b="0" c="0" d="0"/></lane>
 <lane id="-2" type="driving"><width sOffset="0" a="3.5" b="0" c="0" d="0"/></lane>
 </right></laneSection></lanes></road></OpenDRIVE>"""
@@ -439,3 +441,141 @@ def test_objects_stay_level_in_conditions(run, condition, starts):
     </EntityCondition></ByEntityCondition></Condition></ConditionGroup></StartTrigger>"""
 
     assert run(scenario(event_start=start), seconds=1.0).begins("event") == [0.0] * starts
+
+
+TURNED = '<Orientation type="relative" h="3.141592653589793"/>'
+
+
+@pytest.mark.parametrize(
+    ("tag", "attributes", "forwards"),
+    [
+        ("LanePosition", 'roadId="1" laneId="1" s="300"', False),
+        ("RoadPosition", 'roadId="1" s="300" t="1.75"', True),
+        ("RelativeLanePosition", 'entityRef="Target" dLane="1" ds="0"', True),
+        ("RelativeLanePosition", 'entityRef="Target" dLane="1" dsLane="0"', False),
+        ("RelativeRoadPosition", 'entityRef="Target" ds="0" dt="3.5"', True),
+    ],
+)
+@pytest.mark.parametrize("orientation", ["", '<Orientation type="relative" h="0"/>', TURNED])
+def test_no_orientation_is_a_relative_one_of_zero(run, tag, attributes, forwards, orientation):
+    init = private("Target", put(lane(-1, 300.0)), speed(10.0))
+    init += private("Ego", put(f"<{tag} {attributes}>{orientation}</{tag}>"), speed(10.0))
+    found = run(scenario(init=init), seconds=1.0).ego
+
+    along = forwards != (orientation == TURNED)
+    assert found[-1].x - found[0].x == pytest.approx(9.0 if along else -9.0, abs=1.1)
+
+
+@pytest.mark.parametrize(("minor", "yaw"), [(2, 0.0), (3, math.pi)])
+def test_an_orientation_without_a_type_is_relative_since_version_1_3(run, minor, yaw):
+    position = '<LanePosition roadId="1" laneId="1" s="300"><Orientation h="0"/></LanePosition>'
+    text = scenario(init=private("Ego", put(position), speed(0.0)) + TARGET)
+    found = run(text.replace('revMinor="3"', f'revMinor="{minor}"'), seconds=0.5)
+
+    assert math.remainder(found.ego[0].yaw - yaw, math.tau) == pytest.approx(0.0, abs=1e-9)
+
+
+def trajectory(*points: tuple[float, float]) -> str:
+    vertices = "".join(
+        f'<Vertex time="0"><Position><WorldPosition x="{x}" y="{y}"/></Position></Vertex>'
+        for x, y in points
+    )
+    return f"""<RoutingAction><FollowTrajectoryAction><TrajectoryRef><Trajectory name="t"
+    closed="false"><Shape><Polyline>{vertices}</Polyline></Shape></Trajectory></TrajectoryRef>
+    <TimeReference><None/></TimeReference><TrajectoryFollowingMode followingMode="position"/>
+    </FollowTrajectoryAction></RoutingAction>"""
+
+
+def test_the_heading_at_the_end_of_a_trajectory_is_kept(run):
+    path = trajectory((60.0, -5.25), (70.0, -4.25))
+    found = run(scenario(actor="Ego", action=path)).ego[30:]
+
+    assert [e.yaw for e in found] == pytest.approx([math.atan2(1.0, 10.0)] * len(found))
+    assert found[-1].y == pytest.approx(found[0].y)
+
+
+def test_an_entity_arrives_with_one_that_reverses(run):
+    there = "<{0}>{1}</{0}>"
+    action = f"""<LongitudinalAction><SynchronizeAction masterEntityRef="Target">
+    {there.format("TargetPositionMaster", lane(-1, 80.0))}
+    {there.format("TargetPosition", lane(-2, 110.0))}
+    </SynchronizeAction></LongitudinalAction>"""
+    init = EGO + private("Target", put(lane(-1, 110.0)), speed(-5.0))
+    found = run(scenario(actor="Ego", action=action, init=init), seconds=8.0)
+
+    axle = 2.0 - (2.5 - 0.95)
+    assert found.ego[60].x == pytest.approx(110.0 + axle, abs=0.1)
+
+
+def test_a_time_gap_is_driven_by_who_follows(run):
+    action = """<LongitudinalAction><LongitudinalDistanceAction entityRef="Target" timeGap="2"
+    continuous="true" freespace="false" displacement="leadingReferencedEntity"/>
+    </LongitudinalAction>"""
+    init = private("Ego", put(lane(-2, 100.0)), speed(20.0))
+    init += private("Target", put(lane(-2, 60.0)), speed(10.0))
+    found = run(scenario(actor="Ego", action=action, init=init))
+
+    axle = 2.0 - (2.5 - 0.95)
+    assert found.ego[-1].x - axle == pytest.approx(60.0 + 10.0 * (len(found.ego) - 1) * DT + 20.0)
+
+
+@pytest.mark.parametrize(
+    ("value", "limit", "seconds"),
+    [(30.0, 'maxAcceleration="5"', 4.0), (0.0, 'maxDeceleration="2"', 5.0)],
+)
+def test_a_speed_changes_within_the_performance_of_its_vehicle(run, value, limit, seconds):
+    how = 'dynamicsShape="linear" dynamicsDimension="time" value="1"'
+    name = limit.partition("=")[0]
+    slow = vehicle("Ego").replace(f'{name}="10"', limit)
+    text = scenario(actor="Ego", action=speed(value, how), entities=slow + vehicle("Target"))
+    found = run(text, seconds=7.0).ego
+
+    for step, ego in enumerate(found):
+        share = min(max((step * DT - 0.5) / seconds, 0.0), 1.0)
+        assert ego.speed == pytest.approx(10.0 + (value - 10.0) * share, abs=0.06)
+
+
+def test_a_continuous_relative_speed_has_its_transition(run):
+    how = 'dynamicsShape="linear" dynamicsDimension="time" value="2"'
+    action = speed(0.0, how).replace(
+        '<AbsoluteTargetSpeed value="0.0"/>',
+        '<RelativeTargetSpeed entityRef="Target" value="2" speedTargetValueType="delta" '
+        'continuous="true"/>',
+    )
+    found = run(scenario(actor="Ego", action=action)).ego
+
+    assert found[15].speed == pytest.approx(11.0, abs=0.02)
+    assert found[-1].speed == pytest.approx(12.0)
+
+
+def test_an_entity_stops_at_the_end_of_its_road(run):
+    init = private("Ego", put(lane(-2, 580.0)), speed(10.0)) + TARGET
+    found = run(scenario(init=init)).ego
+
+    axle = 2.0 - (2.5 - 0.95)
+    assert found[10].x == pytest.approx(590.0 + axle)
+    assert (found[-1].x, found[-1].speed) == (pytest.approx(600.0 + axle), 0.0)
+
+
+def test_an_offset_relative_to_an_entity_is_measured_from_the_entity(run):
+    action = """<LateralAction><LaneOffsetAction continuous="false">
+    <LaneOffsetActionDynamics dynamicsShape="step"/><LaneOffsetTarget>
+    <RelativeTargetLaneOffset entityRef="Target" value="-1"/></LaneOffsetTarget>
+    </LaneOffsetAction></LateralAction>"""
+    found = run(scenario(actor="Ego", action=action)).ego
+
+    assert found[-1].y == pytest.approx(-1.75 - 1.0)
+
+
+def test_a_route_changes_lanes_without_turning_back(run):
+    points = "".join(
+        f'<Waypoint routeStrategy="shortest"><Position>{p}</Position></Waypoint>'
+        for p in (lane(-2, 55.1), lane(-1, 300.0))
+    )
+    action = f"""<RoutingAction><AssignRouteAction><Route name="r" closed="false">{points}</Route>
+    </AssignRouteAction></RoutingAction>"""
+    found = run(scenario(actor="Ego", action=action, init=EGO)).ego
+
+    steps = [b.x - a.x for a, b in itertools.pairwise(found)]
+    assert min(steps) > 0.9
+    assert found[-1].y == pytest.approx(-1.75)

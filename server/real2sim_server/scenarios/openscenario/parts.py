@@ -33,10 +33,15 @@ Resolve = Callable[[Part, str], Part]
 
 
 class Positions:
-    """Reads positions; ``entry`` looks up catalog entries."""
+    """Reads positions.
 
-    def __init__(self, entry: Resolve) -> None:
-        self.entry = entry
+    Args:
+        entry: looks up catalog entries.
+        orientation: type of an orientation without one, which depends on the version of the file.
+    """
+
+    def __init__(self, entry: Resolve, orientation: str) -> None:
+        self.entry, self._default = entry, orientation
 
     def position(self, part: Part) -> Fields:
         """The position in an element."""
@@ -75,7 +80,7 @@ class Positions:
         if found is None:
             return None
         _level(found)
-        relative = found.choice("type", {"relative": True, "absolute": False}, "absolute")
+        relative = found.choice("type", {"relative": True, "absolute": False}, self._default)
         return {"h": found.number("h", 0.0), "relative": relative}
 
     def _world(self, part: Part) -> Fields:

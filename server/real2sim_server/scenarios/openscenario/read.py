@@ -375,7 +375,8 @@ class _Reader:
     def __init__(self, whole: Part, folder: Path | None, options: ReadOptions) -> None:
         self._whole, self._folder, self._options = whole, folder, options
         self.catalogs = Catalogs(folder, options.leave_out)
-        positions = Positions(self.catalogs.entry)
+        minor = whole.child("FileHeader").integer("revMinor")
+        positions = Positions(self.catalogs.entry, "relative" if minor >= 3 else "absolute")
         self._actions, self._conditions = Actions(positions), Conditions(positions)
         self._notes, self.road_file = whole.notes, None
 

@@ -40,8 +40,9 @@ from .motion import (
     SpeedCourse,
     Synchronize,
     duration,
+    duration_at,
     gentle_duration,
-    lane_offset,
+    offset_of,
 )
 from .roads import Place, RoadPoint, Trajectory, Way, course_of, path_through
 from .view import ACROSS, EntityState, PositionResolver, View, across, distance_ahead
@@ -61,13 +62,11 @@ class Beginning:
         view: current instant.
         places: resolves positions at that instant.
         token: token of the action.
-        version: version of the storyboard.
     """
 
     view: View
     places: PositionResolver
     token: int
-    version: int
 
 
 def begun(actor: EntityState, action: Any, at: Beginning) -> EntityState:
@@ -83,9 +82,9 @@ def _done(actor: EntityState, at: Beginning, **changes: Any) -> EntityState:
     return copy_with(actor, finished=actor.finished | {at.token}, **changes)
 
 
-def _dynamics(dynamics: Dynamics, at: Beginning) -> Dynamics:
+def _dynamics(dynamics: Dynamics) -> Dynamics:
     """Dynamics with a positive rate: some files use negative rates for braking."""
-    if at.version < 2 or dynamics.dimension != "rate":
+    if dynamics.dimension != "rate":
         return dynamics
     return dynamics.model_copy(update={"value": abs(float(dynamics.value))})
 
@@ -109,16 +108,23 @@ def _on_lane(actor: EntityState, at: Beginning) -> EntityState:
 
 def _speed(actor: EntityState, action: SpeedAction, at: Beginning) -> EntityState:
     actor = _freed(actor)
-    value, dynamics = float(action.speed), _dynamics(action.dynamics, at)
-    if action.continuous and action.relative_to is not None:
-        rate = float(dynamics.value) if dynamics.dimension == "rate" else math.inf
-        rate = math.inf if dynamics.shape == "step" else rate
-        follow = FollowSpeed(at.token, action.relative_to, action.relation, value, rate)
-        return copy_with(actor, longitudinal=follow)
+    value, dynamics = float(action.speed), _dynamics(action.dynamics)
     if action.relative_to is not None:
         other = at.view.entities[action.relative_to].speed
         value = other + value if action.relation == "delta" else other * value
+    limits = actor.performance
+    if limits.speed is not None:
+        value = min(max(value, -float(limits.speed)), float(limits.speed))
     seconds = _speed_duration(dynamics, actor.speed, value)
+    most = limits.acceleration if value > actor.speed else limits.deceleration
+    if seconds > 0.0 and most is not None:
+        seconds = max(seconds, duration_at(dynamics.shape, value - actor.speed, float(most)))
+    if action.continuous and action.relative_to is not None:
+        follow = FollowSpeed(
+            at.token, action.relative_to, action.relation, float(action.speed), dynamics.shape,
+            actor.speed, seconds,
+        )  # fmt: skip
+        return copy_with(actor, speed=actor.speed if seconds > 0.0 else value, longitudinal=follow)
     if seconds <= 0.0:
         return _done(actor, at, speed=value, longitudinal=None)
     change = SpeedChange(at.token, dynamics.shape, actor.speed, value, seconds)
@@ -201,21 +207,20 @@ def _lane_change(actor: EntityState, action: LaneChangeAction, at: Beginning) ->
         lane = network.neighbour(base.road, base.lane, base.s, lane * sense)
     actor = actor.on_way(network.way(here.road, lane, here.s, along=along))
     end = float(action.offset) * (1.0 if along else -1.0)
-    dynamics, change = _dynamics(action.dynamics, at), end - actor.offset
+    dynamics, change = _dynamics(action.dynamics), end - actor.offset
     by_way = dynamics.dimension == "distance" and dynamics.shape != "step"
     extent = float(dynamics.value) if by_way else duration(dynamics, change)
     return _shifted(actor, dynamics.shape, end, extent, at, by_way=by_way)
 
 
 def _lane_offset(actor: EntityState, action: LaneOffsetAction, at: Beginning) -> EntityState:
-    actor = _on_lane(actor, at)
+    # From now on, offsets of an entity off the road or on a route refer to the centre of its lane.
+    actor = _on_lane(actor, at).on_lane(at.view.network)
     value, acceleration = float(action.offset), action.acceleration
     if action.relative_to is not None:
         if action.continuous and acceleration is None:
             return copy_with(actor, lateral=FollowOffset(at.token, action.relative_to, value))
-        value += lane_offset(at.view.entities[action.relative_to], at.view)
-    # From now on, offsets of an entity off the road or on a route refer to the centre of its lane.
-    actor = actor.on_lane(at.view.network)
+        value += offset_of(at.view.entities[action.relative_to], actor, at.view)
     if action.continuous and acceleration is None:
         return copy_with(actor, lateral=HoldOffset(at.token, value))
     most = None if acceleration is None else float(acceleration)
@@ -300,7 +305,7 @@ def _teleport(actor: EntityState, action: TeleportAction, at: Beginning) -> Enti
     place = at.places.of(action.position)
     put = actor.put(place, at.view.network)
     route = actor.way
-    if at.version >= 2 and route is not None and route.assigned and _is_near_route(place, route):
+    if route is not None and route.assigned and _is_near_route(place, route):
         put = put.on_way(route)
     return _done(put, at, lateral=None)
 

@@ -18,7 +18,16 @@ from ..common import copy_with
 from ..traffic.driver import acceleration as idm_acceleration
 from ..traffic.driver import advance_along, leading_agent
 from .roads import Place
-from .view import EntityState, Moved, Shifted, View, across, coasting, distance_ahead
+from .view import (
+    EntityState,
+    Moved,
+    Shifted,
+    View,
+    across,
+    coasting,
+    distance_ahead,
+    offsets,
+)
 
 STEEPEST = {"linear": 1.0, "cubic": 1.5, "sinusoidal": math.pi / 2, "quintic": 1.875}
 """Maximum slope of each shape f(u), u from 0 to 1."""
@@ -64,7 +73,12 @@ def duration(dynamics: Dynamics, change: float) -> float:
         return 0.0
     if dynamics.dimension == "time":
         return value
-    return STEEPEST[dynamics.shape] * abs(change) / value if value > 0 else 0.0
+    return duration_at(dynamics.shape, change, value) if value > 0 else 0.0
+
+
+def duration_at(shape: Shape, change: float, rate: float) -> float:
+    """Duration of a change whose rate is ``rate`` at most [s]; not for a step."""
+    return STEEPEST[shape] * abs(change) / max(rate, 1e-6)
 
 
 def gentle_duration(shape: Shape, change: float, acceleration: float | None) -> float:
@@ -100,7 +114,7 @@ class OffsetChange:
 
 @dataclass(frozen=True)
 class FollowOffset:
-    """Keeps a lateral distance to the lane offset of another entity."""
+    """Keeps a lateral distance to another entity."""
 
     token: int
     other: str
@@ -108,7 +122,7 @@ class FollowOffset:
 
     def step(self, actor: EntityState, view: View, way: float, h: float) -> Shifted:
         """The change after ``h`` seconds and ``way`` metres."""
-        return Shifted(self.value + lane_offset(view.entities[self.other], view), self)
+        return Shifted(self.value + offset_of(view.entities[self.other], actor, view), self)
 
 
 @dataclass(frozen=True)
@@ -150,12 +164,9 @@ class KeepAside:
         return Shifted(actor.offset + step, None if there and not self.action.continuous else self)
 
 
-def lane_offset(actor: EntityState, view: View) -> float:
-    """Offset of an entity from its lane centre, positive left in driving direction [m]."""
-    if actor.way is not None and actor.way.lane:
-        return actor.offset
-    on_lane = actor.on_lane(view.network)
-    return on_lane.offset
+def offset_of(other: EntityState, actor: EntityState, view: View) -> float:
+    """Offset of another entity from the path of an entity, along the road between them [m]."""
+    return actor.offset + offsets(actor, Place(other.x, other.y, other.h), "lane", view.network)[1]
 
 
 DONE = 1e-9
@@ -220,20 +231,42 @@ class SpeedCourse:
 
 @dataclass(frozen=True)
 class FollowSpeed:
-    """Follows the speed of another entity, with an offset or factor and a rate limit."""
+    """Changes to a speed relative to another entity with a shape over time, and keeps it.
+
+    The speed changes within the performance of the entity.
+    """
 
     token: int
     other: str
     relation: str
     value: float
-    rate: float
+    shape: Shape
+    start: float
+    duration: float
+    elapsed: float = 0.0
 
     def step(self, actor: EntityState, view: View, h: float) -> Moved:
         """The motion after ``h`` seconds."""
-        speed = view.entities[self.other].speed
+        speed, elapsed = view.entities[self.other].speed, self.elapsed + h
         wanted = speed + self.value if self.relation == "delta" else speed * self.value
-        change = min(max(wanted - actor.speed, -self.rate * h), self.rate * h)
-        return Moved((actor.speed + change / 2) * h, actor.speed + change, self)
+        if elapsed < self.duration:
+            wanted = self.start + (wanted - self.start) * progress(
+                self.shape, elapsed / self.duration
+            )
+        end = within_performance(actor, wanted, h)
+        return Moved((actor.speed + end) / 2 * h, end, replace(self, elapsed=elapsed))
+
+
+def within_performance(actor: EntityState, speed: float, h: float) -> float:
+    """The speed that an entity reaches of a wanted one after ``h`` seconds."""
+    limits = actor.performance
+    if limits.speed is not None:
+        speed = min(max(speed, -float(limits.speed)), float(limits.speed))
+    if limits.deceleration is not None:
+        speed = max(speed, actor.speed - float(limits.deceleration) * h)
+    if limits.acceleration is not None:
+        speed = min(speed, actor.speed + float(limits.acceleration) * h)
+    return speed
 
 
 @dataclass(frozen=True)
@@ -268,7 +301,8 @@ class KeepDistance:
         if aim.distance is not None:
             distance = float(aim.distance)
         else:
-            distance = float(aim.time_gap or 0.0) * actor.speed
+            follower = other if self.leading else actor
+            distance = float(aim.time_gap or 0.0) * follower.speed
         if aim.freespace:
             behind, front = (other, actor) if not self.leading else (actor, other)
             distance += front.size[0] / 2 + front.centre[0]
@@ -315,14 +349,17 @@ class Synchronize:
     def step(self, actor: EntityState, view: View, h: float) -> Moved:
         """The motion after ``h`` seconds."""
         master = view.entities[self.master]
-        to_go = _left(master, self.master_target, view)
+        ahead = _left(master, self.master_target, view)
+        to_go = -ahead if master.speed < 0.0 else ahead
         left = _left(actor, self.target, view)
-        v = actor.speed
-        if to_go <= self.tolerances[0] + DONE or left <= self.tolerances[1] + DONE:
+        v, stands = actor.speed, abs(master.speed) <= MIN_MASTER_SPEED
+        # A master at rest may still reverse to a target behind it.
+        arrived = (abs(to_go) if stands else to_go) <= self.tolerances[0] + DONE
+        if arrived or left <= self.tolerances[1] + DONE:
             return Moved(v * h, self._final(master, v), None)
-        if master.speed <= MIN_MASTER_SPEED:
+        if stands:
             return Moved(v * h, v, self)
-        time = to_go / master.speed
+        time = to_go / abs(master.speed)
         rate = self._solved(left, v, time)
         if self.limits != SpeedLimits():
             way, speed = advance_along(0.0, v, self._limited(v, rate, h), h)
@@ -451,15 +488,36 @@ def _on_way(actor: EntityState, view: View, way: float, h: float) -> EntityState
         offset, then = control.step(actor, view, way, h)
         if then is None:
             finished |= {control.token}
-    return copy_with(
+    # The speed is that of the whole motion, along the path and across it.
+    aside = min(abs(offset - actor.offset), abs(way))
+    moved = copy_with(
         actor,
-        s=actor.s + way,
+        s=actor.s + math.copysign(math.sqrt(way * way - aside * aside), way),
         offset=offset,
+        turn=actor.turn if control is None else 0.0,
         drift=(offset - actor.offset) / h,
         lateral=then,
         finished=finished,
         travelled=actor.travelled + abs(way),
-    ).placed()
+    )
+    return _within_road(moved, view).placed()
+
+
+def _within_road(actor: EntityState, view: View) -> EntityState:
+    """The entity on the next lane if its path has ended; it stops where there is none."""
+    way = actor.way
+    assert way is not None
+    end = way.path.length if way.assigned else way.length
+    beyond = actor.s - end
+    if beyond <= 0.0:
+        return actor
+    onward = copy_with(actor, s=end, drift=0.0).placed().on_lane(view.network)
+    assert onward.way is not None
+    if onward.way.lane and onward.way.length - onward.s > beyond:
+        return copy_with(onward, s=onward.s + beyond, drift=actor.drift)
+    if way.assigned:
+        return actor
+    return copy_with(actor, s=end, speed=0.0, drift=0.0)
 
 
 def _on_trajectory(actor: EntityState, view: View, way: float, h: float) -> EntityState:

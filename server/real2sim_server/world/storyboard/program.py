@@ -126,11 +126,10 @@ def program_of(board: Storyboard) -> Program:
     Raises:
         WorldError: INVALID_REQUEST if entities are placed relative to each other in a cycle.
     """
-    maker = _Maker(board.version)
+    maker = _Maker()
     stories = tuple(maker.story(story) for story in board.stories)
     elements = sorted((e for s in stories for e in s.within()), key=lambda e: e.number)
-    init = tuple(board.init) if board.version < 2 else _in_order(board.init)
-    return Program(board, init, stories, tuple(elements), maker.start(board.stop))
+    return Program(board, _in_order(board.init), stories, tuple(elements), maker.start(board.stop))
 
 
 PLACING = frozenset({"teleport", "follow_trajectory"})
@@ -172,9 +171,8 @@ def _is_ready(entry: InitAction, waiting: Sequence[InitAction], k: int) -> bool:
 
 
 class _Maker:
-    def __init__(self, version: int) -> None:
+    def __init__(self) -> None:
         self._elements, self._conditions = 0, 0
-        self._version = version
 
     def start(self, trigger: Trigger | None) -> Start | None:
         if trigger is None:
@@ -188,8 +186,7 @@ class _Maker:
 
     def _begin(self, trigger: Trigger | None) -> Trigger | None:
         """The start trigger; without conditions, its element starts with its parent."""
-        asked = trigger is not None and (trigger.groups or self._version < 2)
-        return trigger if asked else None
+        return trigger if trigger is not None and trigger.groups else None
 
     def story(self, story: Any) -> Element:
         path = (story.name,)

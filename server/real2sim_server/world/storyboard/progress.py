@@ -298,7 +298,7 @@ class Progress:
     def _begin_private(self, name: str, action: Any, elapsed: float) -> None:
         actor = self.entities[name]
         view = self._view(elapsed, first=True)
-        at = Beginning(view, self._places(), self._token, self._program.board.version)
+        at = Beginning(view, self._places(), self._token)
         self._token += 1
         self.entities[name] = begun(actor, action, at)
 

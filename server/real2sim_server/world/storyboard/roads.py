@@ -205,6 +205,9 @@ def path_through(places: list[Place]) -> LoggedPath:
 REACH = 2000.0
 """Maximum length of paths along lanes [m]."""
 
+LANE_CHANGE = 30.0
+"""Length of a lane change on a route [m]."""
+
 
 @dataclass(frozen=True, eq=False)
 class GraphNetwork:
@@ -273,12 +276,17 @@ class GraphNetwork:
         A lane change is a straight line to the centre of the neighbouring lane.
         """
         lanes = [self.graph.lane(name) for name in names]
-        parts = list[Float]()
-        for k, lane in enumerate(lanes):
-            low = start if k == 0 else 0.0
-            high = end if k == len(lanes) - 1 else lane.length
+        parts, low = list[Float](), start
+        for lane, onward in zip(lanes, [*lanes[1:], None], strict=True):
+            high = end if onward is None else lane.length
+            low = min(low, high)
+            parts.append(np.array([lane.at(low)[:3]]))
+            if onward is not None and onward.lane_id not in lane.successors:
+                low = low / lane.length * onward.length + LANE_CHANGE
+                continue
             inner = lane.centre[(lane.s > low) & (lane.s < high)]
-            parts += [np.array([lane.at(low)[:3]]), inner, np.array([lane.at(high)[:3]])]
+            parts += [inner, np.array([lane.at(high)[:3]])]
+            low = 0.0
         return np.concatenate(parts)
 
     def _road(self, road: str) -> Road:

@@ -25,6 +25,7 @@ from real2sim_proto.storyboard import (
     Uniform,
     resolved,
 )
+from real2sim_proto.storyboard_actions import SpeedLimits
 
 from ...edit import ObjectState, ScenarioState
 from ...edit.compose import figure_of
@@ -395,7 +396,7 @@ class StoryboardRun:
     def over(self) -> bool:
         """Whether it has been stopped or, without a stop trigger, all stories are complete."""
         program, status = self.program, self.state.status
-        if self.state.over or (program.stop is not None and program.board.version >= 2):
+        if self.state.over or program.stop is not None:
             return self.state.over
         return bool(program.stories) and all(status[s.number] == COMPLETE for s in program.stories)
 
@@ -461,12 +462,17 @@ def _first(
     The ego and objects of the scene are at their recorded poses; others are not in the world.
     """
     size, centre = box_of(entity, subject, ego_size)
-    if entity.kind == "ego" and board.version >= 2:
+    if entity.kind == "ego":
         centre = own_centre(entity, size) or centre
     scripted = entity.kind != "ego" or board.drives_ego
     actor = EntityState(
         entity.name, entity.category, subject, size, centre, 0.0, 0.0, 0.0,
         scripted=scripted, visible=entity.kind == "ego",
+        performance=SpeedLimits(
+            speed=entity.max_speed,
+            acceleration=entity.max_acceleration,
+            deceleration=entity.max_deceleration,
+        ),
     )  # fmt: skip
     if entity.kind == "ego":
         return observed(actor, surroundings.ego, 0.0).on_lane(network)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 
 from real2sim_proto import ErrorCode
@@ -18,6 +18,7 @@ from real2sim_proto.storyboard_actions import (
     RelativeWorldPosition,
     RoadPosition,
     RoutePosition,
+    SpeedLimits,
     TrajectoryPosition,
     WorldPosition,
 )
@@ -83,17 +84,19 @@ class EntityState:
         centre: box centre relative to the reference point [m].
         x, y, h: reference point [m], heading [rad].
         z: height of the reference point [m]; None for the ground.
-        speed: speed along its path [m/s].
-        drift: lateral speed, positive left [m/s].
+        speed: speed [m/s]; negative in reverse.
+        drift: part of it across the path, positive left [m/s].
         acceleration: along its path [m/s^2].
         way: path that it follows; None for an ego driven by a planner.
         s, offset: distance along the path, and offset from it [m].
+        turn: heading relative to the path, besides that of its drift [rad].
         travelled: distance travelled since the start of the episode [m].
         visible: whether it is in the world.
         scripted: whether the storyboard moves it.
         longitudinal, lateral: active controllers, or None.
         trajectory: trajectory that it follows instead of its path, or None.
         finished: tokens of finished actions.
+        performance: its limits.
     """
 
     name: str
@@ -111,6 +114,7 @@ class EntityState:
     way: Way | None = None
     s: float = 0.0
     offset: float = 0.0
+    turn: float = 0.0
     travelled: float = 0.0
     visible: bool = True
     scripted: bool = True
@@ -118,6 +122,7 @@ class EntityState:
     lateral: Lateral | None = None
     trajectory: Trajectory | None = None
     finished: frozenset[int] = frozenset()
+    performance: SpeedLimits = field(default_factory=SpeedLimits)
 
     @property
     def middle(self) -> tuple[float, float]:
@@ -145,7 +150,8 @@ class EntityState:
         if self.way is not None and self.trajectory is None:
             yaw = self.way.path.at(self.s)[3]
         cos, sin = math.cos(yaw), math.sin(yaw)
-        return self.speed * cos - self.drift * sin, self.speed * sin + self.drift * cos
+        ahead = math.copysign(math.sqrt(max(self.speed**2 - self.drift**2, 0.0)), self.speed)
+        return ahead * cos - self.drift * sin, ahead * sin + self.drift * cos
 
     def tokens(self) -> set[int]:
         """Tokens of the actions that currently move it."""
@@ -153,11 +159,16 @@ class EntityState:
         return {m.token for m in moving if m is not None}
 
     def put(self, place: Place, network: RoadNetwork) -> EntityState:
-        """The entity at a place, on the lane there or a straight path, at the same speed."""
+        """The entity at a place, on the lane there or a straight path, at the same speed.
+
+        It keeps its heading relative to the lane.
+        """
         put = copy_with(
             self, x=place.x, y=place.y, h=place.h, z=place.z, drift=0.0, trajectory=None
-        )
-        return put.on_lane(network)
+        ).on_lane(network)
+        assert put.way is not None
+        turn = 0.0 if put.way.lane == 0 else place.h - put.way.path.at(put.s)[3]
+        return copy_with(put, turn=math.remainder(turn, math.tau))
 
     def on_lane(self, network: RoadNetwork) -> EntityState:
         """The entity on the lane at its position if it heads along it, else on a straight path."""
@@ -184,12 +195,14 @@ class EntityState:
         """The entity at its path, s and offset, rotated by its drift."""
         assert self.way is not None
         x, y, _, yaw = self.way.path.at(self.s)
-        turn = math.atan2(self.drift, self.speed) if abs(self.speed) > SLOW and self.drift else 0.0
+        turn = 0.0
+        if abs(self.speed) > SLOW and self.drift:
+            turn = math.asin(min(max(self.drift / self.speed, -1.0), 1.0))
         return copy_with(
             self,
             x=x - self.offset * math.sin(yaw),
             y=y + self.offset * math.cos(yaw),
-            h=yaw + turn,
+            h=yaw + self.turn + turn,
         )
 
     def pose(self, ground: Ground) -> AgentPose:
@@ -439,7 +452,7 @@ class PositionResolver:
 
     def _road(self, p: RoadPosition) -> Place:
         place = self.network.place(p.road, float(p.s), float(p.t))
-        return place._replace(h=self._heading(p.orientation, place.h, place.h))
+        return place._replace(h=self._heading(p.orientation, place.h))
 
     def _lane(self, p: LanePosition) -> Place:
         return self._in_lane(p.road, int(p.lane), float(p.s), float(p.offset), p.orientation)
@@ -449,15 +462,18 @@ class PositionResolver:
         place = self.network.place(
             here.road, here.s + sense * float(p.ds), here.t + sense * float(p.dt)
         )
-        driving = place.h if sense > 0 else place.h + math.pi
-        return place._replace(h=self._heading(p.orientation, place.h, driving))
+        return place._replace(h=self._heading(p.orientation, place.h))
 
     def _relative_lane(self, p: RelativeLanePosition) -> Place:
         here, sense = self._where(p.entity)
         lanes = int(p.lanes) * int(sense)
         lane = self.network.neighbour(here.road, here.lane, here.s, lanes)
         s = here.s + sense * float(p.ds)
-        return self._in_lane(here.road, lane, s, float(p.offset), p.orientation)
+        if p.along == "lane":
+            return self._in_lane(here.road, lane, s, float(p.offset), p.orientation)
+        t = self.network.middle(here.road, lane, s) + float(p.offset)
+        place = self.network.place(here.road, s, t)
+        return place._replace(h=self._heading(p.orientation, place.h))
 
     def _route(self, p: RoutePosition) -> Place:
         path = self.network.route([self.of(w) for w in p.route.waypoints])
@@ -467,13 +483,13 @@ class PositionResolver:
         if here is not None and p.lane is not None:
             return self._in_lane(here.road, int(p.lane), here.s, t, p.orientation)
         place = Place(x - t * math.sin(h), y + t * math.cos(h), h)
-        return place._replace(h=self._heading(p.orientation, h, h))
+        return place._replace(h=self._heading(p.orientation, h))
 
     def _trajectory(self, p: TrajectoryPosition) -> Place:
         x, y, h, _ = course_of(p.curve, self.of).at(float(p.s))
         t = float(p.t)
         place = Place(x - t * math.sin(h), y + t * math.cos(h), h)
-        return place._replace(h=self._heading(p.orientation, h, h))
+        return place._replace(h=self._heading(p.orientation, h))
 
     def _in_lane(
         self, road: str, lane: int, s: float, offset: float, orientation: Orientation | None
@@ -481,7 +497,7 @@ class PositionResolver:
         t = self.network.middle(road, lane, s) + offset
         place = self.network.place(road, s, t)
         driving = place.h if self.network.drives_along(road, lane) else place.h + math.pi
-        return place._replace(h=self._heading(orientation, place.h, driving))
+        return place._replace(h=self._heading(orientation, driving))
 
     def _where(self, entity: str) -> tuple[RoadPoint, float]:
         """Road position of an entity; and 1 if it drives along the reference line, else -1."""
@@ -495,8 +511,8 @@ class PositionResolver:
             )
         return here, 1.0 if math.cos(actor.h - here.h) >= 0.0 else -1.0
 
-    def _heading(self, orientation: Orientation | None, road: float, driving: float) -> float:
-        return driving if orientation is None else self._turned(orientation, road)
+    def _heading(self, orientation: Orientation | None, base: float) -> float:
+        return base if orientation is None else self._turned(orientation, base)
 
     def _turned(self, orientation: Orientation, base: float) -> float:
         h = float(orientation.h)

@@ -49,15 +49,6 @@ def test_a_storyboard_survives_a_fork_and_an_export(client, url):
     assert stored(client, copy.headers["Location"]) == board
 
 
-def test_an_export_of_an_earlier_version_keeps_its_version(client, url):
-    client.post(f"{url}/corner-case", json={"name": "cut_in"})
-    export = client.get(f"{url}/export").json()
-    assert export["entries"][0]["operations"][0]["storyboard"].pop("version") == 2
-    copy = client.post("/v1/scenarios/import", json=export).headers["Location"]
-
-    assert stored(client, copy).version == 1
-
-
 def test_a_negative_time_is_refused_with_the_path_to_it(client, url):
     board = corner_case("cut_in").storyboard().model_dump(mode="json")
     board["parameters"]["duration"] = -2.0

@@ -10,7 +10,6 @@ from real2sim_proto.storyboard import Storyboard
 from real2sim_server.edit import EditError, ScenarioState, apply_operations
 from real2sim_server.edit.state import pack_state, unpack_state
 from real2sim_server.world import World
-from real2sim_server.world.replay import stored_spec
 
 from .boards import action_at, board
 
@@ -44,14 +43,6 @@ def test_a_reset_may_bring_its_own_or_none(world, written):
 def test_it_survives_a_snapshot(world, written):
     again = unpack_state(ScenarioState.of(world.scene), pack_state(written))
     assert again.storyboard == written.storyboard
-
-
-def test_one_of_an_old_log_runs_by_the_rules_of_its_time(written):
-    fields = ResetSpec(storyboard=written.storyboard).model_dump(mode="json")
-    assert stored_spec(fields).storyboard.version == 2
-    del fields["storyboard"]["version"]
-    assert stored_spec(fields).storyboard.version == 1
-    assert stored_spec(fields | {"storyboard": None}).storyboard is None
 
 
 def test_it_is_not_set_while_an_episode_runs(world):
