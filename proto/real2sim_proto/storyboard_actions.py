@@ -72,7 +72,7 @@ class RoadPosition(Model):
 
 
 class RelativeRoadPosition(Model):
-    """Relative to an entity's road position."""
+    """Relative to an entity, along the reference line and to the left of it."""
 
     kind: Literal["relative_road"] = "relative_road"
     entity: Reference
@@ -93,16 +93,17 @@ class LanePosition(Model):
 
 
 class RelativeLanePosition(Model):
-    """In the lane `lanes` to the left (positive, in the sense of the reference line) of an
-    entity's, at a distance along it in the entity's direction of travel."""
+    """Relative to an entity, in its lane or `lanes` lanes to the left of it.
+
+    Ahead and left are those of the entity, or with `along` "road" those of the reference line.
+    """
 
     kind: Literal["relative_lane"] = "relative_lane"
     entity: Reference
     lanes: int | Value = 0
     ds: Value
     along: Literal["lane", "road"] = Field(
-        default="road",
-        description="measure `ds` along the centre of its lane, or the reference line",
+        default="lane", description="direction of `ds`, `lanes`, `offset` and relative headings"
     )
     offset: Value = 0.0
     orientation: Orientation | None = ALONG

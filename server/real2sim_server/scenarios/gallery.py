@@ -123,8 +123,8 @@ AGAINST = {"h": 3.141592653589793, "relative": True}
 def ahead(ds: Any, *, lanes: int = 0, offset: Any = 0.0, **more: Any) -> Fields:
     """A position ahead of the ego, in its lane or ``lanes`` lanes to the left."""
     return {
-        "kind": "relative_lane", "entity": "Ego", "lanes": lanes, "ds": ds, "offset": offset,
-        **more,
+        "kind": "relative_lane", "entity": "Ego", "along": "road", "lanes": lanes, "ds": ds,
+        "offset": offset, **more,
     }  # fmt: skip
 
 

@@ -466,6 +466,23 @@ def test_no_orientation_is_a_relative_one_of_zero(run, tag, attributes, forwards
     assert found[-1].x - found[0].x == pytest.approx(9.0 if along else -9.0, abs=1.1)
 
 
+@pytest.mark.parametrize(
+    "position",
+    [
+        '<RelativeRoadPosition entityRef="Target" ds="-10" dt="-3.5"/>',
+        '<RelativeLanePosition entityRef="Target" ds="-10" dLane="-1"/>',
+        '<RelativeLanePosition entityRef="Target" dsLane="10" dLane="1"/>',
+    ],
+)
+def test_only_lane_coordinates_follow_an_entity_that_drives_against_its_road(run, position):
+    init = private("Target", put(lane(1, 300.0)), speed(0.0)) + private("Ego", put(position))
+    ego = run(scenario(init=init), seconds=0.5).ego[0]
+
+    axle = 2.0 - (2.5 - 0.95)
+    assert ego.x - axle * math.cos(ego.yaw) == pytest.approx(290.0)
+    assert ego.y == pytest.approx(-1.75)
+
+
 @pytest.mark.parametrize(("minor", "yaw"), [(2, 0.0), (3, math.pi)])
 def test_an_orientation_without_a_type_is_relative_since_version_1_3(run, minor, yaw):
     position = '<LanePosition roadId="1" laneId="1" s="300"><Orientation h="0"/></LanePosition>'
@@ -579,3 +596,17 @@ def test_a_route_changes_lanes_without_turning_back(run):
     steps = [b.x - a.x for a, b in itertools.pairwise(found)]
     assert min(steps) > 0.9
     assert found[-1].y == pytest.approx(-1.75)
+
+
+@pytest.mark.parametrize("s", [60.0, 95.0])
+def test_a_distance_without_limits_is_there_from_the_start(run, s):
+    action = """<LongitudinalAction><LongitudinalDistanceAction entityRef="Target" distance="20"
+    continuous="false" freespace="false" displacement="trailingReferencedEntity"/>
+    </LongitudinalAction>"""
+    init = private("Target", put(lane(-2, 110.0)), speed(10.0))
+    init += private("Ego", put(lane(-2, s)), speed(10.0), action)
+    found = run(scenario(init=init), seconds=1.0).ego
+
+    axle = 2.0 - (2.5 - 0.95)
+    assert found[0].x == pytest.approx(90.0 + axle)
+    assert found[-1].speed == pytest.approx(10.0)

@@ -20,6 +20,7 @@ from real2sim_proto.storyboard_actions import (
     LateralDistanceAction,
     LongitudinalDistanceAction,
     SpeedAction,
+    SpeedLimits,
     SpeedProfileAction,
     SynchronizeAction,
     TeleportAction,
@@ -161,7 +162,13 @@ def _longitudinal_distance(
     other = at.view.entities[action.entity]
     ahead = distance_ahead(actor, other.x, other.y, at.view.network)
     leading = ahead < 0.0 if action.place == "any" else action.place == "leading"
-    return copy_with(actor, longitudinal=KeepDistance(at.token, action, leading))
+    keep = KeepDistance(at.token, action, leading)
+    if action.limits == SpeedLimits() and actor.trajectory is None:
+        # Without limits it is there at once, also in the init actions.
+        actor = copy_with(actor, s=actor.s + keep.error(actor, at.view)).placed()
+        if not action.continuous:
+            return _done(actor, at, longitudinal=None)
+    return copy_with(actor, longitudinal=keep)
 
 
 def _synchronize(actor: EntityState, action: SynchronizeAction, at: Beginning) -> EntityState:

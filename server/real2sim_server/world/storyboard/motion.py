@@ -279,21 +279,25 @@ class KeepDistance:
 
     def step(self, actor: EntityState, view: View, h: float) -> Moved:
         """The motion after ``h`` seconds, as fast as the limits allow without overshoot."""
-        other = view.entities[self.action.entity]
-        ahead = distance_ahead(actor, other.x, other.y, view.network)
-        error = ahead - self._wanted(actor, other)
+        other, error = view.entities[self.action.entity], self.error(actor, view)
         closing = error + other.speed * h
         limits = self.action.limits
         if limits.acceleration is None and limits.deceleration is None:
             # Unlimited: reach the target at the end of the step.
             most = math.inf if limits.speed is None else float(limits.speed)
-            way = min(max(closing, 0.0), most * h)
+            way = closing if math.isinf(most) else min(max(closing, 0.0), most * h)
             speed = min(other.speed, most) if abs(way - closing) < DONE else way / h
             return Moved(way, speed, self._then(0.0 if way == closing else error, 0.0))
         speed = _approach(actor.speed, other.speed, error, h, limits)
         left = error + (other.speed - (actor.speed + speed) / 2) * h
         way = (actor.speed + speed) / 2 * h
         return Moved(way, speed, self._then(left, speed - other.speed))
+
+    def error(self, actor: EntityState, view: View) -> float:
+        """Distance that it is behind its place, along its path [m]."""
+        other = view.entities[self.action.entity]
+        ahead = distance_ahead(actor, other.x, other.y, view.network)
+        return ahead - self._wanted(actor, other)
 
     def _wanted(self, actor: EntityState, other: EntityState) -> float:
         """Target distance of the other entity ahead; negative if this one leads."""
@@ -495,7 +499,8 @@ def _on_way(actor: EntityState, view: View, way: float, h: float) -> EntityState
         s=actor.s + math.copysign(math.sqrt(way * way - aside * aside), way),
         offset=offset,
         turn=actor.turn if control is None else 0.0,
-        drift=(offset - actor.offset) / h,
+        # The lateral motion of a change is over at its end, also if its shape ends abruptly.
+        drift=(offset - actor.offset) / h if then is not None else 0.0,
         lateral=then,
         finished=finished,
         travelled=actor.travelled + abs(way),

@@ -458,20 +458,18 @@ class PositionResolver:
         return self._in_lane(p.road, int(p.lane), float(p.s), float(p.offset), p.orientation)
 
     def _relative_road(self, p: RelativeRoadPosition) -> Place:
-        here, sense = self._where(p.entity)
-        place = self.network.place(
-            here.road, here.s + sense * float(p.ds), here.t + sense * float(p.dt)
-        )
+        here, _ = self._where(p.entity)
+        place = self.network.place(here.road, here.s + float(p.ds), here.t + float(p.dt))
         return place._replace(h=self._heading(p.orientation, place.h))
 
     def _relative_lane(self, p: RelativeLanePosition) -> Place:
         here, sense = self._where(p.entity)
-        lanes = int(p.lanes) * int(sense)
-        lane = self.network.neighbour(here.road, here.lane, here.s, lanes)
-        s = here.s + sense * float(p.ds)
+        sense = sense if p.along == "lane" else 1.0
+        lane = self.network.neighbour(here.road, here.lane, here.s, int(p.lanes) * int(sense))
+        s, offset = here.s + sense * float(p.ds), sense * float(p.offset)
         if p.along == "lane":
-            return self._in_lane(here.road, lane, s, float(p.offset), p.orientation)
-        t = self.network.middle(here.road, lane, s) + float(p.offset)
+            return self._in_lane(here.road, lane, s, offset, p.orientation)
+        t = self.network.middle(here.road, lane, s) + offset
         place = self.network.place(here.road, s, t)
         return place._replace(h=self._heading(p.orientation, place.h))
 
