@@ -221,7 +221,7 @@ def _scene(bundle: Path | None, board: Storyboard, road_file: Path | None, made:
     """The scene to drive in; a flat scene is first written to ``made`` to give it a hash."""
     from ..maps import MapError
     from ..scenarios import ScenarioError
-    from ..scenarios.flat_scene import flat_scene
+    from ..scenarios.flat_scene import flat_scene, positions_off_roads
     from ..scene.io import load_scene, save_scene
     from ..sweeps.spec import open_scene
     from ..world import WorldError
@@ -232,8 +232,9 @@ def _scene(bundle: Path | None, board: Storyboard, road_file: Path | None, made:
         flat = flat_scene(board, road_file)
     except (ScenarioError, MapError, WorldError) as error:
         raise CommandError(str(error)) from error
-    for note in flat.lanes.notes if flat.lanes is not None else ():
-        console.print(f"note: {note}", markup=False, highlight=False)
+    if flat.lanes is not None:
+        for note in (*flat.lanes.notes, *positions_off_roads(board, flat.lanes)):
+            console.print(f"note: {note}", markup=False, highlight=False)
     save_scene(flat, made)
     return load_scene(made)
 

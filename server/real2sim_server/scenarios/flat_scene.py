@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 import torch
 
+from real2sim_proto.base import Model
 from real2sim_proto.storyboard import MapRoads, RouteLanes, Storyboard, resolved
 from real2sim_proto.storyboard_actions import (
     LanePosition,
@@ -234,6 +235,29 @@ def _graph(board: Storyboard, road_file: Path | None) -> LaneGraph | None:
             "the file says, or run the scenario on a scene"
         )
     return read_map(road_file)
+
+
+def positions_off_roads(board: Storyboard, graph: LaneGraph) -> list[str]:
+    """One note for each position beyond the ends of its road; it is moved to the nearest end."""
+    found = dict[str, None]()
+
+    def visit(part: Any) -> None:
+        if isinstance(part, LanePosition | RoadPosition) and part.road in graph.roads:
+            s, length = float(part.s), graph.road(part.road).length
+            if not 0.0 <= s <= length:
+                found[
+                    f"s = {s:g} m is not on road {part.road!r}, which is {length:g} m long; the "
+                    "position is moved to its end"
+                ] = None
+        elif isinstance(part, list):
+            for each in part:
+                visit(each)
+        elif isinstance(part, Model):
+            for each in part.__dict__.values():
+                visit(each)
+
+    visit(resolved(board))
+    return list(found)
 
 
 def _start(run: StoryboardRun) -> tuple[Place, float, dict[str, Any]]:

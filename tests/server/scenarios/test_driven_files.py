@@ -18,15 +18,30 @@ from real2sim_server.world.recording import Recording, load_recording
 DT = 0.1
 """Step of an episode [s]."""
 
-ROAD = """<OpenDRIVE><header revMajor="1" revMinor="5"/>
-<road id="1" junction="-1" length="600" rule="RHT"><planView>
-<geometry s="0" x="0" y="0" hdg="0" length="600"><line/></geometry></planView>
-<lanes><laneSection s="0"><left>
-<lane id="1" type="driving"><width sOffset="0" a="3.5" b="0" c="0" d="0"/></lane></left>
-<center><lane id="0" type="none"/></center><right>
-<lane id="-1" type="driving"><width sOffset="0" a="3.5" b="0" c="0" d="0"/></lane>
-<lane id="-2" type="driving"><width sOffset="0" a="3.5" b="0" c="0" d="0"/></lane>
-</right></laneSection></lanes></road></OpenDRIVE>"""
+RADIUS = 100.0
+
+
+def road(number: int, start: str, length: float, shape: str, link: str) -> str:
+    """A road with lanes 1, -1 and -2, linked with those of the other road."""
+
+    def lane_of(lane: int) -> str:
+        return f"""<lane id="{lane}" type="driving"><link><{link} id="{lane}"/></link>
+        <width sOffset="0" a="3.5" b="0" c="0" d="0"/></lane>"""
+
+    return f"""<road id="{number}" junction="-1" length="{length}" rule="RHT">
+    <link><{link} elementType="road" elementId="{3 - number}"
+    contactPoint="{"start" if link == "successor" else "end"}"/></link>
+    <planView><geometry s="0" {start} length="{length}">{shape}</geometry></planView>
+    <lanes><laneSection s="0"><left>{lane_of(1)}</left><center><lane id="0" type="none"/></center>
+    <right>{lane_of(-1)}{lane_of(-2)}</right></laneSection></lanes></road>"""
+
+
+ROAD = f"""<OpenDRIVE><header revMajor="1" revMinor="5"/>
+{road(1, 'x="0" y="0" hdg="0"', 600.0, "<line/>", "successor")}
+{road(2, 'x="600" y="0" hdg="0"', 50 * math.pi, f'<arc curvature="{1 / RADIUS}"/>', "predecessor")}
+</OpenDRIVE>"""
+"""600 m straight on, then a quarter of a circle to the left."""
+
 CUT_IN = """<LateralAction><LaneChangeAction>
 <LaneChangeActionDynamics dynamicsShape="sinusoidal" dynamicsDimension="time" value="2"/>
 <LaneChangeTarget><AbsoluteTargetLane value="-2"/></LaneChangeTarget>
@@ -57,8 +72,8 @@ def put(position: str) -> str:
     return f"<TeleportAction><Position>{position}</Position></TeleportAction>"
 
 
-def lane(number: int, s: float) -> str:
-    return f'<LanePosition roadId="1" laneId="{number}" s="{s}"/>'
+def lane(number: int, s: float, road: int = 1) -> str:
+    return f'<LanePosition roadId="{road}" laneId="{number}" s="{s}"/>'
 
 
 def private(entity: str, *actions: str) -> str:
@@ -565,13 +580,39 @@ def test_a_continuous_relative_speed_has_its_transition(run):
     assert found[-1].speed == pytest.approx(12.0)
 
 
-def test_an_entity_stops_at_the_end_of_its_road(run):
-    init = private("Ego", put(lane(-2, 580.0)), speed(10.0)) + TARGET
-    found = run(scenario(init=init)).ego
+def test_an_entity_drives_on_to_the_next_road_and_stops_at_its_end(run):
+    init = private("Ego", put(lane(-2, 580.0)), speed(20.0)) + TARGET
+    found = run(scenario(init=init), seconds=12.0).ego
 
-    axle = 2.0 - (2.5 - 0.95)
-    assert found[10].x == pytest.approx(590.0 + axle)
-    assert (found[-1].x, found[-1].speed) == (pytest.approx(600.0 + axle), 0.0)
+    # Its reference point is 0.45 m behind the rear axle.
+    assert math.hypot(found[-1].x - (600.0 + RADIUS + 5.25), found[-1].y - (RADIUS + 0.45)) < 0.05
+    assert (found[60].speed, found[-1].speed) == (pytest.approx(20.0), 0.0)
+
+
+@pytest.mark.parametrize(
+    ("attributes", "angle", "radius"),
+    [
+        ('entityRef="Target" ds="100" dLane="-1"', 0.5, 105.25),
+        ('entityRef="Target" dsLane="100" dLane="0"', 0.5, 101.75),
+    ],
+)
+def test_a_relative_position_continues_on_the_next_road(run, attributes, angle, radius):
+    position = f"<RelativeLanePosition {attributes}/>"
+    init = private("Ego", put(position)) + private("Target", put(lane(-1, 550.0)), speed(0.0))
+    ego = run(scenario(init=init), seconds=0.5).ego[0]
+
+    x, y = ego.x - 0.45 * math.cos(angle), ego.y - 0.45 * math.sin(angle)
+    assert ego.yaw == pytest.approx(angle)
+    assert x == pytest.approx(600.0 + radius * math.sin(angle), abs=0.01)
+    assert y == pytest.approx(RADIUS - radius * math.cos(angle), abs=0.01)
+
+
+def test_a_position_beyond_its_road_is_noted_and_moved_to_its_end(run):
+    init = private("Ego", put(lane(-2, 700.0)), speed(0.0)) + TARGET
+    found = run(scenario(init=init), seconds=0.5)
+
+    assert found.ego[0].x == pytest.approx(600.45)
+    assert "s = 700 m is not on road '1', which is 600 m long" in " ".join(found.output.split())
 
 
 def test_an_offset_relative_to_an_entity_is_measured_from_the_entity(run):

@@ -162,13 +162,25 @@ def _longitudinal_distance(
     other = at.view.entities[action.entity]
     ahead = distance_ahead(actor, other.x, other.y, at.view.network)
     leading = ahead < 0.0 if action.place == "any" else action.place == "leading"
-    keep = KeepDistance(at.token, action, leading)
-    if action.limits == SpeedLimits() and actor.trajectory is None:
+    limits = _within(action.limits, actor.performance)
+    keep = KeepDistance(at.token, action.model_copy(update={"limits": limits}), leading)
+    if limits == SpeedLimits() and actor.trajectory is None:
         # Without limits it is there at once, also in the init actions.
         actor = copy_with(actor, s=actor.s + keep.error(actor, at.view)).placed()
         if not action.continuous:
             return _done(actor, at, longitudinal=None)
     return copy_with(actor, longitudinal=keep)
+
+
+def _within(limits: SpeedLimits, performance: SpeedLimits) -> SpeedLimits:
+    """Limits of an action, if it has any, within the performance of its entity."""
+    if limits == SpeedLimits():
+        return limits
+    given, most = limits.model_dump(), performance.model_dump()
+    return SpeedLimits(**{
+        name: min((v for v in (given[name], most[name]) if v is not None), default=None)
+        for name in given
+    })  # fmt: skip
 
 
 def _synchronize(actor: EntityState, action: SynchronizeAction, at: Beginning) -> EntityState:

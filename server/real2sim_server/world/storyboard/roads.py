@@ -23,7 +23,7 @@ from real2sim_proto.storyboard_actions import (
 )
 
 from ...scene.errors import SceneError
-from ...scene.lane import LANE_KINDS, Road
+from ...scene.lane import LANE_KINDS, Lane, Road
 from ...scene.lane_graph import LaneGraph
 from ..common import WorldError
 from ..path import Float, LoggedPath
@@ -80,8 +80,18 @@ class RoadNetwork(Protocol):
     def locate(self, x: float, y: float, h: float) -> RoadPoint | None:
         """The road position of a place with a heading; None outside all lanes."""
 
+    def onward(self, road: str, lane: int, s: float, ds: float) -> tuple[str, int, float, float]:
+        """Road, lane and s at ``ds`` further along the reference line of a lane's road.
+
+        Beyond the road, on the roads that continue the lane, as far as they go. The last value is
+        1, or -1 if that road runs the other way. Raises WorldError: no such road or lane.
+        """
+
     def place(self, road: str, s: float, t: float) -> Place:
-        """The place at (s, t) of a road, with its heading. Raises WorldError: no such road."""
+        """The place at (s, t) of a road, with its heading; ``s`` is limited to the road.
+
+        Raises WorldError: no such road.
+        """
 
     def middle(self, road: str, lane: int, s: float) -> float:
         """t of a lane centre at ``s``. Raises WorldError: no such lane there."""
@@ -134,6 +144,11 @@ class RouteNetwork:
             return None
         lane = number if near.offset > 0 else -number
         return RoadPoint("route", lane, near.s - self._shift, near.offset, near.yaw)
+
+    def onward(  # noqa: D102
+        self, road: str, lane: int, s: float, ds: float
+    ) -> tuple[str, int, float, float]:
+        return road, lane, s + ds, 1.0
 
     def place(self, road: str, s: float, t: float) -> Place:  # noqa: D102
         x, y, _, yaw = self.reference.at(s + self._shift)
@@ -232,11 +247,30 @@ class GraphNetwork:
         s, t = graph.road(road).project(x, y)
         return RoadPoint(road, lane, s, t, graph.road(road).at(s)[3])
 
+    def onward(  # noqa: D102
+        self, road: str, lane: int, s: float, ds: float
+    ) -> tuple[str, int, float, float]:
+        sense, left = 1.0, ds
+        while True:
+            length = self._road(road).length
+            if 0.0 <= s + sense * left <= length:
+                return road, lane, s + sense * left, sense
+            up = sense * left > 0.0
+            edge = length if up else 0.0
+            left = math.copysign(abs(left) - abs(edge - s), ds)
+            forwards = up == self.drives_along(road, lane)
+            onward = self._next(self._part(road, lane, edge)[0], forwards=forwards)
+            if onward is None or onward.lane_id not in self.graph.road_places:
+                return road, lane, edge, sense
+            road, lane = self.graph.road_places[onward.lane_id]
+            up = forwards == self.drives_along(road, lane)
+            sense = 1.0 if up == (ds > 0.0) else -1.0
+            s = 0.0 if up else self._road(road).length
+
     def place(self, road: str, s: float, t: float) -> Place:  # noqa: D102
         found = self._road(road)
-        x, y, z, h = found.at(s, t)
-        beyond = min(s, 0.0) + max(s - found.length, 0.0)
-        return Place(x + beyond * math.cos(h), y + beyond * math.sin(h), h, z)
+        x, y, z, h = found.at(min(max(s, 0.0), found.length), t)
+        return Place(x, y, h, z)
 
     def middle(self, road: str, lane: int, s: float) -> float:  # noqa: D102
         return self._part(road, lane, s)[1]
@@ -305,17 +339,21 @@ class GraphNetwork:
             raise _refused(error) from error
         return part.lane_id, part.centre_t(held)
 
+    def _next(self, lane_id: str, *, forwards: bool, besides: Sequence[Lane] = ()) -> Lane | None:
+        """The lane that continues a lane and turns least; None if it ends."""
+        lane, before = self.graph.lane(lane_id), self.graph.predecessors
+        names = lane.successors if forwards else before[lane_id]
+        onward = [found for n in names if (found := self.graph.lane(n)) not in besides]
+        return min(onward, key=lambda each: (each.turn, each.lane_id), default=None)
+
     def _path(self, lane_id: str, *, forwards: bool) -> tuple[LoggedPath, float]:
         lanes, length = [self.graph.lane(lane_id)], 0.0
-        before = self.graph.predecessors
         while length < REACH:
             length += lanes[-1].length
-            names = lanes[-1].successors if forwards else before[lanes[-1].lane_id]
-            onward = [self.graph.lane(n) for n in names]
-            onward = [lane for lane in onward if lane not in lanes]
-            if not onward:
+            onward = self._next(lanes[-1].lane_id, forwards=forwards, besides=lanes)
+            if onward is None:
                 break
-            lanes.append(min(onward, key=lambda lane: (lane.turn, lane.lane_id)))
+            lanes.append(onward)
         points = np.concatenate([lane.centre for lane in lanes[:: 1 if forwards else -1]])
         yaws = np.unwrap(
             np.concatenate([lane.headings for lane in lanes[:: 1 if forwards else -1]])

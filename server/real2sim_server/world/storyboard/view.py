@@ -459,18 +459,22 @@ class PositionResolver:
 
     def _relative_road(self, p: RelativeRoadPosition) -> Place:
         here, _ = self._where(p.entity)
-        place = self.network.place(here.road, here.s + float(p.ds), here.t + float(p.dt))
+        road, _, s, sense = self.network.onward(here.road, here.lane, here.s, float(p.ds))
+        place = self.network.place(road, s, sense * (here.t + float(p.dt)))
         return place._replace(h=self._heading(p.orientation, place.h))
 
     def _relative_lane(self, p: RelativeLanePosition) -> Place:
-        here, sense = self._where(p.entity)
-        sense = sense if p.along == "lane" else 1.0
-        lane = self.network.neighbour(here.road, here.lane, here.s, int(p.lanes) * int(sense))
-        s, offset = here.s + sense * float(p.ds), sense * float(p.offset)
+        here, along = self._where(p.entity)
+        along = along if p.along == "lane" else 1.0
+        road, lane, s, sense = self.network.onward(
+            here.road, here.lane, here.s, along * float(p.ds)
+        )
+        left = sense * along
+        lane = self.network.neighbour(road, lane, s, int(p.lanes) * int(left))
         if p.along == "lane":
-            return self._in_lane(here.road, lane, s, offset, p.orientation)
-        t = self.network.middle(here.road, lane, s) + offset
-        place = self.network.place(here.road, s, t)
+            return self._in_lane(road, lane, s, left * float(p.offset), p.orientation)
+        t = self.network.middle(road, lane, s) + left * float(p.offset)
+        place = self.network.place(road, s, t)
         return place._replace(h=self._heading(p.orientation, place.h))
 
     def _route(self, p: RoutePosition) -> Place:
