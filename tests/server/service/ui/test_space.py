@@ -1,4 +1,4 @@
-"""The 3D view, rendered by the page (software WebGL)."""
+"""The 3D view, rendered by the page in software WebGL, which needs a core of its own."""
 
 from __future__ import annotations
 
@@ -17,15 +17,20 @@ from tests.waiting import wait_until
 
 from .hands import drag, kept, shown
 
-pytestmark = [pytest.mark.browser, pytest.mark.network]
+pytestmark = [pytest.mark.browser, pytest.mark.network, pytest.mark.slow]
 MIN_PSNR = 38.0
 """[dB]. Measured: 45."""
 
 
 @pytest.fixture(scope="module")
 def browser_args() -> list[str]:
-    """WebGL in software."""
-    return ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+    """WebGL in software, without the watchdog that ends it on a busy machine."""
+    return [
+        "--no-sandbox",
+        "--use-angle=swiftshader",
+        "--enable-unsafe-swiftshader",
+        "--disable-gpu-watchdog",
+    ]
 
 
 def opened(studio: Any, width: int = 700) -> Any:
