@@ -13,7 +13,32 @@ let jobs = [];
 let all = false;
 let timer = null;
 
+let video = null;
+let list = null;
+
+// The controls stay in place when the list is drawn again, so that they keep the focus.
 export function startWork() {
+  video = el("button", {
+    id: "make-video",
+    class: "primary",
+    title: "From the selected camera",
+    onclick: attempt(film),
+  });
+  const others = el("input", { id: "work-of-all", type: "checkbox", checked: all });
+  others.onchange = () => {
+    all = others.checked;
+    draw();
+  };
+  list = el("div", {});
+  page().replaceChildren(
+    el(
+      "div",
+      { class: "actions" },
+      video,
+      el("label", { class: "check" }, others, " work of all scenarios"),
+    ),
+    list,
+  );
   draw();
 }
 export const listWork = attempt(async () => {
@@ -35,24 +60,8 @@ function ofScenario(job) {
 function draw() {
   const listed = jobs.filter((job) => all || ofScenario(job));
   const [running, done] = [listed.filter(active), listed.filter((job) => !active(job))];
-  const others = el("input", { id: "work-of-all", type: "checkbox", checked: all });
-  others.onchange = () => {
-    all = others.checked;
-    draw();
-  };
-  page().replaceChildren(
-    el(
-      "div",
-      { class: "actions" },
-      el("button", {
-        id: "make-video",
-        class: "primary",
-        textContent: model.job ? "Film of this run" : "Film of the scenario",
-        title: "From the selected camera",
-        onclick: attempt(film),
-      }),
-      el("label", { class: "check" }, others, " work of all scenarios"),
-    ),
+  video.textContent = model.job ? "Film of this run" : "Film of the scenario";
+  list.replaceChildren(
     ...(listed.length
       ? []
       : [
@@ -65,8 +74,8 @@ function draw() {
     ...group("Done", done),
   );
 }
-const group = (title, list) =>
-  list.length ? [el("h2", { class: "group-title", textContent: title }), ...list.map(entry)] : [];
+const group = (title, some) =>
+  some.length ? [el("h2", { class: "group-title", textContent: title }), ...some.map(entry)] : [];
 
 function entry(job) {
   const name = nameOf(job);

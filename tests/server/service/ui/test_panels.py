@@ -110,6 +110,13 @@ def test_keys_act_on_the_focused_control(studio):
     )
 
 
+def test_a_control_of_the_work_list_keeps_the_focus_when_the_list_is_drawn_again(studio):
+    studio.click("[data-tab='work']")
+    studio.focus("#work-of-all")
+    studio.evaluate("async () => await (await import('/ui/work.js')).listWork()")
+    assert studio.evaluate("document.activeElement.id") == "work-of-all"
+
+
 def test_fields_are_tabbed_through_and_typing_triggers_no_shortcuts(studio):
     target = first(studio)
     studio.click("#pose-x")
