@@ -12,7 +12,6 @@ const page = () => document.getElementById("work");
 let jobs = [];
 let all = false;
 let timer = null;
-
 let video = null;
 let list = null;
 

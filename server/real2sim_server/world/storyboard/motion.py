@@ -258,7 +258,7 @@ class FollowSpeed:
 
 
 def within_performance(actor: EntityState, speed: float, h: float) -> float:
-    """The speed that an entity reaches of a wanted one after ``h`` seconds."""
+    """Speed after ``h`` seconds towards a wanted speed, within the limits of the entity."""
     limits = actor.performance
     if limits.speed is not None:
         speed = min(max(speed, -float(limits.speed)), float(limits.speed))
@@ -294,7 +294,7 @@ class KeepDistance:
         return Moved(way, speed, self._then(left, speed - other.speed))
 
     def error(self, actor: EntityState, view: View) -> float:
-        """Distance that it is behind its place, along its path [m]."""
+        """Distance by which it is behind its target, along its path [m]."""
         other = view.entities[self.action.entity]
         ahead = distance_ahead(actor, other.x, other.y, view.network)
         return ahead - self._wanted(actor, other)

@@ -223,6 +223,9 @@ REACH = 2000.0
 LANE_CHANGE = 30.0
 """Length of a lane change on a route [m]."""
 
+MAX_ROADS = 1000
+"""Maximum number of roads along which a relative position continues."""
+
 
 @dataclass(frozen=True, eq=False)
 class GraphNetwork:
@@ -251,7 +254,7 @@ class GraphNetwork:
         self, road: str, lane: int, s: float, ds: float
     ) -> tuple[str, int, float, float]:
         sense, left = 1.0, ds
-        while True:
+        for _ in range(MAX_ROADS):
             length = self._road(road).length
             if 0.0 <= s + sense * left <= length:
                 return road, lane, s + sense * left, sense
@@ -266,6 +269,7 @@ class GraphNetwork:
             up = forwards == self.drives_along(road, lane)
             sense = 1.0 if up == (ds > 0.0) else -1.0
             s = 0.0 if up else self._road(road).length
+        return road, lane, s, sense
 
     def place(self, road: str, s: float, t: float) -> Place:  # noqa: D102
         found = self._road(road)

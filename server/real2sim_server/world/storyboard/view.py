@@ -96,7 +96,7 @@ class EntityState:
         longitudinal, lateral: active controllers, or None.
         trajectory: trajectory that it follows instead of its path, or None.
         finished: tokens of finished actions.
-        performance: its limits.
+        performance: limits of its speed and acceleration.
     """
 
     name: str
@@ -195,14 +195,14 @@ class EntityState:
         """The entity at its path, s and offset, rotated by its drift."""
         assert self.way is not None
         x, y, _, yaw = self.way.path.at(self.s)
-        turn = 0.0
+        drifting = 0.0
         if abs(self.speed) > SLOW and self.drift:
-            turn = math.asin(min(max(self.drift / self.speed, -1.0), 1.0))
+            drifting = math.asin(min(max(self.drift / self.speed, -1.0), 1.0))
         return copy_with(
             self,
             x=x - self.offset * math.sin(yaw),
             y=y + self.offset * math.cos(yaw),
-            h=yaw + self.turn + turn,
+            h=yaw + self.turn + drifting,
         )
 
     def pose(self, ground: Ground) -> AgentPose:
