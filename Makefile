@@ -48,7 +48,7 @@ kernels-drawing kernels-learning kernels-physics: kernels-%: $(STAMP)
 	$(BIN)/python scripts/compile_kernels.py $*
 
 test-slow: $(STAMP)
-	$(PYTEST) $(PARALLEL) --run-slow -m "slow or gpu or ray"
+	$(PYTEST) $(PARALLEL) --run-slow -m "slow or browser or gpu or ray"
 
 # Programs that some tests start, from Debian's packages; where one is missing its tests skip.
 system-packages:

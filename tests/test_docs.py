@@ -71,6 +71,7 @@ def test_the_rest_page_lists_every_error_code_with_its_status() -> None:
     assert told == [(c.value, HTTP_STATUS[c], c in RETRYABLE) for c in ErrorCode]
 
 
+@pytest.mark.slow
 def test_the_site_builds_without_warnings_and_shows_no_internals(tmp_path: Path) -> None:
     folders = ["-d", tmp_path / "doctrees", REPOSITORY / "docs", tmp_path / "site"]
     command = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", *folders]

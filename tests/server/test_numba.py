@@ -178,12 +178,14 @@ def change(package: Path, old: str, new: str, *, file: str = "parts.py") -> None
     path.write_text(source.replace(old, new))
 
 
+@pytest.mark.slow
 def test_kernels_that_an_image_brings_along_are_used_from_a_folder_that_is_read_only(package):
     cache = package / "cache"
     assert run(package, cache=cache) == (BEFORE, "compiled")
     assert run(package, cache=cache, before=READ_ONLY) == (BEFORE, "kept")
 
 
+@pytest.mark.slow
 def test_a_kernel_that_cannot_be_kept_is_compiled_each_time(package):
     cache = package / "cache"
     for _ in range(2):
@@ -194,6 +196,7 @@ def test_a_kernel_is_compiled_once(package):
     assert run(package, seed=1) == (BEFORE, "kept")
 
 
+@pytest.mark.slow
 def test_how_many_kernels_are_ready_is_told_while_some_are_compiled(package):
     assert told(package) == []
     change(package, "FACTOR = 2.0", "FACTOR = 3.0")
@@ -217,6 +220,7 @@ def test_processes_that_need_a_kernel_at_once_compile_it_once(package):
     assert its_misses + other_misses == 1
 
 
+@pytest.mark.slow
 def test_a_low_priority_process_does_not_block_others(package):
     change(package, "FACTOR = 2.0", "FACTOR = 3.0")
     slow = started(package, before=SLOW)
@@ -228,6 +232,7 @@ def test_a_low_priority_process_does_not_block_others(package):
         slow.communicate()
 
 
+@pytest.mark.slow
 def test_a_lock_that_another_never_gives_back_delays_only(package):
     change(package, "FACTOR = 2.0", "FACTOR = 3.0")
     (lock,) = package.rglob("*.lock")

@@ -178,6 +178,7 @@ def test_recorded_poses_stand_on_the_ground(scene):
         np.testing.assert_allclose(stood[:3, 2], recorded[:3, 2], atol=0.01)
 
 
+@pytest.mark.slow
 def test_a_log_of_a_known_street_gives_its_true_heights():
     log = generate_log(CONFIG)
     street = log.source.drive.street

@@ -30,6 +30,7 @@ def test_small_image_mode_does_not_lose_quality() -> None:
 
 
 @pytest.mark.network
+@pytest.mark.slow
 def test_sessions_over_sockets_are_measured() -> None:
     figures = learn.sessions_over_sockets(read_packed(SHIPPED), OPTIONS)
     assert figures["steps_per_s"] > 0

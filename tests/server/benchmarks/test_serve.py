@@ -30,6 +30,7 @@ def test_pauses_of_a_process_are_recorded(monkeypatch):
     assert serve._read_the_clock(0.02) == pytest.approx([0.01, 0.015])
 
 
+@pytest.mark.slow
 def test_pauses_are_summarized_over_all_cores():
     figures = serve.pauses(0.05)
     assert figures["cores"] >= 1

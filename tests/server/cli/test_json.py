@@ -94,7 +94,12 @@ def test_every_command_with_a_json_option_is_tested():
     assert with_figures - CLIENT == set(COMMANDS) | {"search"}
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+SLOW = {"fit-lidar", "track", "train-policy"}
+
+
+@pytest.mark.parametrize("command", [
+    pytest.param(name, marks=[pytest.mark.slow] if name in SLOW else []) for name in COMMANDS
+])  # fmt: skip
 def test_commands_write_json_figures(made, command, tmp_path):
     words, found = made
     figures = found.get(command) or figures_of(command, words, tmp_path / "figures.json")

@@ -45,6 +45,7 @@ def folders(tmp_path) -> dict[str, str]:
     }
 
 
+@pytest.mark.slow
 def test_a_lost_device_exits_with_an_error(serve, folders):
     done = serve(before=LOST, **folders)
     assert done.exit_code == 1, done.printed
@@ -59,6 +60,7 @@ def test_an_unusable_cuda_backend_is_refused_without_a_traceback(serve, folders)
     assert "pip install" in done.printed or "driver" in done.printed
 
 
+@pytest.mark.slow
 def test_an_unreachable_store_is_reported_without_a_traceback(serve, folders):
     url = "postgresql+pg8000://nobody:hunter2@127.0.0.1:9/none"
     done = serve(STORE_URL=url, LOG_FORMAT="json", **folders)

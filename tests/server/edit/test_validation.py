@@ -98,6 +98,7 @@ def test_objects_far_from_everything_recorded_are_reported(state, y, expected):
     assert warnings(state, Translate(object_id="parked", y=y)) == expected
 
 
+@pytest.mark.slow
 def test_edits_of_a_large_scenario_do_not_resample_trajectories(state, monkeypatch):
     """With 600 overlapping copies, the cost of a batch grows steadily, without a jump."""
     copies = [Duplicate(object_id="parked", new_id=f"copy_{k}", x=0.01) for k in range(600)]

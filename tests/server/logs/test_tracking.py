@@ -97,6 +97,7 @@ def test_boxes_rest_on_the_road_and_have_names(found: tuple[ObjectTrack, ...]) -
         assert np.abs(bottom).max() < 0.25
 
 
+@pytest.mark.slow
 def test_tracking_is_reproducible(drive: DrivingLog) -> None:
     short = dataclasses.replace(drive, frame_times_us=drive.frame_times_us[:8])
     options = TrackingOptions(min_distance=1.0)

@@ -77,6 +77,7 @@ def test_parameters_observed_on_finer_cells_are_found_within_uncertainty():
     assert found.discretisation["stiffness"] > 0.01
 
 
+@pytest.mark.slow
 def test_residuals_never_rise_and_diverging_steps_are_reverted():
     start = observed(pressed(SOFT), ["speed"])
     # A hundred times too stiff is far beyond what this substep can handle.
@@ -86,6 +87,7 @@ def test_residuals_never_rise_and_diverging_steps_are_reverted():
     assert (np.diff(found.residual) < 0).all()
 
 
+@pytest.mark.slow
 def test_a_parameter_without_effect_stays_and_is_reported_unknown():
     solver = pressed(SOFT)
     names = ["yield_stress", "speed"]

@@ -139,6 +139,7 @@ FAILURES = {
 }
 
 
+@pytest.mark.slow
 def test_failing_planners_are_reported_and_the_others_driven(site, tmp_path, monkeypatch):
     (tmp_path / "bad.py").write_text(BAD)
     monkeypatch.chdir(tmp_path)
@@ -180,6 +181,7 @@ def test_the_command_writes_a_report(evaluated):
     assert "pid" in output
 
 
+@pytest.mark.slow
 def test_a_scene_without_randomness_is_driven_once_with_a_note(evaluated):
     out, output = evaluated
     figures = json.loads((out / "report.json").read_text())
@@ -187,6 +189,7 @@ def test_a_scene_without_randomness_is_driven_once_with_a_note(evaluated):
     assert "driven once, not with 3 seeds: tiny" in output
 
 
+@pytest.mark.slow
 def test_without_seeds_the_output_does_not_mention_them(site, tmp_path, monkeypatch):
     (tmp_path / "bad_again.py").write_text(BAD)
     monkeypatch.chdir(tmp_path)

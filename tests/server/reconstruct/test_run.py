@@ -123,6 +123,7 @@ def test_lead_car_truck_and_tanker_are_objects(jam):
     assert all(len(scene.object(k).cloud) > 3000 for k in ("car_0", "truck_2", "truck_3"))
 
 
+@pytest.mark.slow
 def test_removing_the_lead_car_reveals_road(jam):
     log, scene = jam
     camera, t_us = log.rig["image_02"], int(log.frame_times_us[3])

@@ -197,6 +197,7 @@ def hasty(site, monkeypatch) -> RunningWorker:
 
 
 @pytest.mark.network
+@pytest.mark.slow
 def test_an_http_client_that_never_reads_is_dropped(hasty):
     request = b"GET /openapi.json HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
     before = dropped(hasty, "write_timeout")
@@ -295,6 +296,7 @@ def test_a_connection_over_the_limit_is_refused_if_none_is_idle(make_settings, k
 
 
 @pytest.mark.network
+@pytest.mark.slow
 def test_a_thousand_idle_and_half_open_connections_block_no_client(tmp_path, tiny_scene):
     wanted = 1000
     allow_descriptors(wanted + 200)

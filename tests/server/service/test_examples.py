@@ -181,7 +181,10 @@ def names(
             shutil.rmtree(bundle)
 
 
-@pytest.mark.parametrize("name", sorted(DOCUMENTED))
+@pytest.mark.parametrize("name", [
+    pytest.param(name, marks=[pytest.mark.slow] if name == "AsyncSweeps.start" else [])
+    for name in sorted(DOCUMENTED)
+])  # fmt: skip
 def test_every_public_item_has_an_example_that_runs(name: str, names: dict[str, Any]) -> None:
     item = DOCUMENTED[name]
     assert "Examples:" in item.text, f"{name} has no example"

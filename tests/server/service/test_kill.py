@@ -61,6 +61,7 @@ def start(scenes_dir, tmp_path):
         yield another
 
 
+@pytest.mark.slow
 def test_acknowledged_writes_survive_kills_between_requests(start):
     choose = random.Random(7)
     client = start()

@@ -91,6 +91,7 @@ def drive(workers: Workers, options: dict, *, kills: tuple[int, ...]) -> tuple[l
     return hashes, facts
 
 
+@pytest.mark.slow
 def test_a_drive_across_the_loop_seam_is_identical_after_a_kill(workers):
     # From shortly before the loop seam to shortly after it.
     options = DRIVE | {"start_us": 9_000_000, "horizon": 40}

@@ -46,6 +46,7 @@ def shown(source: str, names: dict[str, Any]) -> Any:
 
 
 @pytest.mark.network
+@pytest.mark.slow
 def test_every_cell_runs(
     worker: RunningWorker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

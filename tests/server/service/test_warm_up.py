@@ -150,6 +150,7 @@ def test_progress_includes_kernels_compiled_by_the_second_process(monkeypatch):
     assert told == ["compiling kernels, on the first run only: 5 of 40"]
 
 
+@pytest.mark.slow
 def test_the_second_process_reports_its_compiled_kernels(worker_kernels):
     process = preflight.compile_in_background("warm_up")
     written, _ = process.communicate(timeout=LIMIT_S)

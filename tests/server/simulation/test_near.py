@@ -61,6 +61,7 @@ SHAPES = {
 
 
 @pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.slow
 def test_round_posts_and_fences_collide_carry_and_are_refused_inside_objects(shape):
     body = block(speed=10.0)
     simulated = simulator(body, SHAPES[shape](at(1.0, 0.22, 0)))

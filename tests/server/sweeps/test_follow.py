@@ -37,6 +37,7 @@ def following(tmp_path, scene_folder):
         process.join()
 
 
+@pytest.mark.slow
 def test_follow_reports_progress_and_ends_with_standard_input(following):
     process, standard_input, log_file = following
     wait_until(lambda: len(json_lines(log_file)) >= 2, "two lines of progress")

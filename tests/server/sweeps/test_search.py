@@ -273,6 +273,7 @@ def test_the_wilson_interval_matches_published_values():
     )
 
 
+@pytest.mark.slow
 def test_splitting_estimates_a_probability_too_small_to_sample():
     """Beyond 4 standard deviations along a diagonal: 3.2e-5."""
     truth = float(norm.sf(4.0))

@@ -164,6 +164,7 @@ def test_flow_of_the_street_is_that_of_its_depth(log):
     assert np.isnan(flow[depth == 0]).all()
 
 
+@pytest.mark.slow
 def test_flow_of_people_leads_to_the_same_people(log):
     times = int(log.frame_times_us[1]), int(log.frame_times_us[2])
     for index in _people(log):

@@ -52,6 +52,7 @@ def test_a_car_ahead_is_seen_from_behind(street):
     assert np.cos(np.array(azimuths) - np.pi).min() > 0.8
 
 
+@pytest.mark.slow
 def test_a_missing_vehicle_half_lowers_coverage(street):
     options = InitialiseOptions(
         max_background=8_000, max_object=3_000, voxel=0.3, ground_spacing=0.5, sky_resolution=16

@@ -183,6 +183,7 @@ def test_the_command_writes_json_and_a_self_contained_report(on_disk):
     assert f"<td>{values['depth_error_p90_m']:.3f}</td>" in html
 
 
+@pytest.mark.slow
 def test_a_scene_of_part_of_a_log_is_evaluated_on_that_part(on_disk, tmp_path):
     scene, figures = tmp_path / "part.r2s", tmp_path / "figures.json"
     part = ["--frames", "2:5", "--cameras", "front"]

@@ -75,6 +75,7 @@ def test_scene_values_are_valid_for_a_bundle(synthetic_scene):
     assert torch.isfinite(synthetic_scene.sky.faces).all()
 
 
+@pytest.mark.slow
 def test_gaussian_budgets_are_respected(synthetic_log):
     options = replace(SMALL, max_background=5_000, max_object=500)
     scene = initialise_scene(synthetic_log, options=options)

@@ -129,6 +129,7 @@ def test_progress_counts_images():
     assert seen == [(1, 4), (2, 4), (3, 4), (4, 4)]
 
 
+@pytest.mark.slow
 def test_a_log_without_lidar_is_initialised_from_triangulated_points():
     log = textured_log(box=True)
     scene = initialise_scene(log, options=InitialiseOptions(ground_spacing=0.5))

@@ -247,6 +247,7 @@ def whole(tiny_log, tiny_scene, tmp_path_factory):
 @pytest.mark.parametrize(
     ("every", "until", "since"), [(20, 33, 20), (12, 38, 36)], ids=["early", "among priors"]
 )
+@pytest.mark.slow
 def test_a_resumed_run_is_bit_identical(tiny_log, tiny_scene, whole, tmp_path, every, until, since):
     expected, folder = whole
     options = replace(BROKEN_OFF, checkpoint_every=every)

@@ -46,6 +46,7 @@ def met(vertices, triangles, directions):
 
 @pytest.mark.parametrize("distance", [6.0, 20.0])
 @pytest.mark.parametrize("build", ["woman", "boy"])
+@pytest.mark.slow
 def test_ranges_of_people_match_their_meshes(build, distance):
     asset = person_asset("somebody", build)
     seconds = np.linspace(0, 3, 31)

@@ -112,6 +112,7 @@ def test_a_search_saves_its_failures_and_an_archive(client, tmp_path):
     assert str(tmp_path).encode() not in left(client, job, "failures.tar")
 
 
+@pytest.mark.slow
 def test_a_sweep_can_be_cancelled(client):
     job = begun(client, method={"kind": "sobol", "count": 400})
     wait_driving(client, job)
@@ -119,6 +120,7 @@ def test_a_sweep_can_be_cancelled(client):
     assert over(client, job)["state"] == "cancelled"
 
 
+@pytest.mark.slow
 def test_a_sweep_resumes_after_a_worker_restart(start_worker, run_worker, tmp_path):
     with run_worker() as client:
         job = begun(client, method={"kind": "sobol", "count": 50})

@@ -69,6 +69,7 @@ def test_other_sessions_do_not_change_the_result(site, join):
     assert fingerprint(join(site.create())) == alone
 
 
+@pytest.mark.slow
 def test_a_new_process_with_another_thread_count_gives_the_same_result(site, join, tmp_path):
     here = fingerprint(join(site.create()))
     worker = KillableWorker(
