@@ -196,6 +196,8 @@ FIT_M = 0.03
 """Accepted distance between the borders of a lane and the given ones."""
 CORNER = math.radians(3.0)
 """Smaller turns of a centre line are not kept exactly."""
+MAX_COMPARED = 2_000_000
+"""Points times segments of a lane whose nearest points are looked for, which takes a second."""
 
 
 def between(left: Float, right: Float) -> tuple[Float, Float] | None:
@@ -203,7 +205,8 @@ def between(left: Float, right: Float) -> tuple[Float, Float] | None:
     they have no length.
 
     Both borders are traversed in parallel, by their share of length, as in Lanelet2 and Argoverse.
-    If the borders of the result leave the given ones, as beside kinks, nearest points are paired.
+    If the borders of the result leave the given ones, as beside kinks, nearest points are paired,
+    unless the lane is a kilometre long with points every metre.
     """
     if len(left) < 2 or len(right) < 2:
         return None
@@ -220,6 +223,8 @@ def between(left: Float, right: Float) -> tuple[Float, Float] | None:
     centre, widths = (a + b) / 2, np.linalg.norm((a - b)[:, :2], axis=1)
     kept = _apart(centre)
     even = (centre[kept], widths[kept]) if kept.sum() > 1 else None
+    if count * (len(left) + len(right)) > MAX_COMPARED:
+        return even
     if (off := _misfit(even, left, right)) <= FIT_M:
         return even
     nearest = _paired(left, right)
