@@ -16,7 +16,7 @@ from real2sim_proto.lanes import AreaKind, LaneKind, SignalKind
 
 from ..geometry import Float
 from ..scene import Area, Lane, LaneGraph, Signal, StopLine
-from .reader import MapError, between, damage_named, head_of, joined, number, read_xml
+from .reader import MapError, between, damage_named, head_of, joined, notes_of, number, read_xml
 
 EARTH_M = 6_378_137.0
 KINDS: dict[str, LaneKind] = {
@@ -37,8 +37,19 @@ AREAS: dict[str, AreaKind] = {
     "walkway": "sidewalk",
     "intersection_area": "junction",
 }
-GERMAN_LIMIT = re.compile(r"^de274(?:\.1)?-([0-9]+)$")
-"""Sign number in the German catalogue of 2017; its last part is the limit [km/h]."""
+GERMAN_LIMIT = re.compile(r"^de274(?:[._]1)?(?:-([0-9]+))?$")
+"""Sign number in the German catalogue of 2017; its last part is the limit [km/h], 30 without it."""
+TOWN_SIGN, TOWN_KMH = "de310", 50.0
+GERMAN_KMH = {
+    ("road", "urban"): 50.0,
+    ("road", "nonurban"): 100.0,
+    ("bus_lane", "urban"): 50.0,
+    ("bus_lane", "nonurban"): 100.0,
+    ("exit", "urban"): 50.0,
+    ("highway", ""): 130.0,
+    ("play_street", ""): 7.0,
+}
+"""Limits by subtype and location in Lanelet2's traffic rules for Germany; "" is any location."""
 SPEED = re.compile(r"^\s*([0-9]+(?:\.[0-9]*)?)\s*(km/h|kmh|mph|m/s|mps)?\s*$")
 UNITS = {"km/h": 1 / 3.6, "kmh": 1 / 3.6, "mph": 0.44704, "m/s": 1.0, "mps": 1.0, None: 1 / 3.6}
 
@@ -46,8 +57,9 @@ UNITS = {"km/h": 1 / 3.6, "kmh": 1 / 3.6, "mph": 0.44704, "m/s": 1.0, "mps": 1.0
 class Lanelet2Reader:
     """Reads lanelets as lanes.
 
-    Order, neighbours and junctions follow from shared points and borders; speed limits, lights,
-    stop lines and right of way from regulatory elements. Positions are ``local_x``, ``local_y`` and
+    Order, neighbours and junctions follow from shared points and borders; lights, stop lines and
+    right of way from regulatory elements; speed limits from them, from tags or, with a note, from
+    the kind of road in Germany. Positions are ``local_x``, ``local_y`` and
     ``ele`` of the nodes if present, otherwise latitude and longitude on a plane about the centre of
     the file (accurate to some centimetres over a few kilometres). Elements that an editor has
     marked as deleted are ignored.
@@ -85,26 +97,37 @@ class _Osm:
     relations: dict[str, _Relation]
     origin: str = ""
     way_of: dict[tuple[str, ...], str] = field(default_factory=dict)
-    left_out: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
+    left_out: dict[str, list[str]] = field(default_factory=dict)
 
     @classmethod
     def of(cls, root: ET.Element, file: str) -> _Osm:
         nodes, drawn, related = (_kept(root, kind) for kind in ("node", "way", "relation"))
         ways = {w.get("id", ""): [n.get("ref", "") for n in w.findall("nd")] for w in drawn}
         places, origin = _places(nodes, file)
+        left_out: dict[str, list[str]] = defaultdict(list)
         for way_id, refs in ways.items():
-            for node in refs:
-                if node not in places:
-                    raise MapError(f"{file}: way {way_id} names node {node}, which is missing")
+            if not all(node in places for node in refs):
+                ways[way_id] = [node for node in refs if node in places]
+                left_out["ways read without nodes that are not there"].append(way_id)
         relations = {}
         for element in related:
             members: dict[str, list[tuple[str, str]]] = defaultdict(list)
             for m in element.findall("member"):
                 members[m.get("role", "")].append((m.get("type", ""), m.get("ref", "")))
             relations[element.get("id", "")] = _Relation(_tags(element), members)
+        known: dict[str, set[str]]
+        known = {"node": set(places), "way": set(ways), "relation": set(relations)}
+        for key, relation in relations.items():
+            if relation.tags.get("type") in ("lanelet", "regulatory_element", "multipolygon"):
+                left_out["relations read without members that are not there"] += [
+                    f"{key} without {kind} {ref}"
+                    for named in relation.members.values()
+                    for kind, ref in named
+                    if ref not in known.get(kind, {ref})
+                ]
         tags = {w.get("id", ""): _tags(w) for w in drawn}
         way_of = {tuple(refs): way for way, refs in ways.items()}
-        return cls(file, places, ways, tags, relations, origin, way_of)
+        return cls(file, places, ways, tags, relations, origin, way_of, left_out)
 
     def line(self, way_id: str) -> Float:
         """Points [N, 3] of a way."""
@@ -115,17 +138,12 @@ class _Osm:
         named = relation.members.get(role, ())
         return [ref for kind, ref in named if kind == "way" and ref in self.ways]
 
-    def notes(self) -> tuple[str, ...]:
-        """Notes on skipped elements by kind, with their number and first names."""
-        return tuple(
-            f"{what}: {len(names)} ({', '.join(names[:5])}{', ...' if len(names) > 5 else ''})"
-            for what, names in self.left_out.items()
-        )
-
 
 def _kept(root: ET.Element, kind: str) -> list[ET.Element]:
-    """Elements of a kind, without those that JOSM has marked as deleted."""
-    return [e for e in root.findall(kind) if e.get("action") != "delete"]
+    """Elements of a kind, without those that JOSM or an OSM server has marked as deleted."""
+    return [
+        e for e in root.findall(kind) if e.get("action") != "delete" and e.get("visible") != "false"
+    ]
 
 
 def _tags(element: ET.Element) -> dict[str, str]:
@@ -210,7 +228,7 @@ def _graph(osm: _Osm, name: str) -> LaneGraph:
     stop_lines, signals = _rules(osm, lanelets, set(lanes))
     return joined(
         lanes.values(), areas=areas, stop_lines=stop_lines, signals=signals,
-        source=f"lanelet2 {name}", geo_reference=osm.origin, notes=osm.notes(),
+        source=f"lanelet2 {name}", geo_reference=osm.origin, notes=notes_of(osm.left_out),
     )  # fmt: skip
 
 
@@ -304,8 +322,10 @@ def _may_cross(osm: _Osm, rim: list[str], side: str) -> bool:
     turned = way is None
     way = way or osm.way_of.get(tuple(reversed(rim)))
     tags = osm.way_tags.get(way, {}) if way else {}
-    if "lane_change" in tags:
-        return tags["lane_change"] in ("yes", "true")
+    towards = "right" if (side == "right") != turned else "left"  # seen along the way
+    for name in ("lane_change", f"lane_change:{towards}"):
+        if name in tags:
+            return tags[name] in ("yes", "true")
     kind, subtype = tags.get("type", ""), tags.get("subtype", "")
     if kind in ("curbstone", "guard_rail", "wall", "fence", "road_border"):
         return False
@@ -317,14 +337,18 @@ def _may_cross(osm: _Osm, rim: list[str], side: str) -> bool:
 
 
 def _speed_limit(osm: _Osm, key: str, relation: _Relation) -> float | None:
-    texts = [relation.tags.get("speed_limit", "")]
+    """The limit of the first regulatory element or of the tags of the lanelet, else the German one
+    of its kind of road.
+    """
+    texts = []
     for _, ref in relation.members.get("regulatory_element", ()):
         rule = osm.relations.get(ref)
         if rule is not None and rule.tags.get("subtype") == "speed_limit":
-            signs = [
-                osm.way_tags[way].get("subtype", "") for way in osm.member_ways(rule, "refers")
-            ]
-            texts = [rule.tags.get("sign_type", ""), rule.tags.get("limit", ""), *signs, *texts]
+            signs = osm.member_ways(rule, "refers")
+            texts += [osm.way_tags[way].get("subtype", "") for way in signs]
+            texts += [rule.tags.get(name, "") for name in ("sign_type", "limit")]
+    cars = ("speed_limit:vehicle:car", "speed_limit:vehicle", "speed_limit")
+    texts += [relation.tags.get(name, "") for name in cars]
     for text in texts:
         if (limit := _speed(text)) is not None:
             return limit
@@ -332,14 +356,24 @@ def _speed_limit(osm: _Osm, key: str, relation: _Relation) -> float | None:
         osm.left_out[f"lanes without a speed limit because {unknown[:40]!r} is not known"].append(
             key
         )
-    return None
+        return None
+    tags = relation.tags
+    kinds = ((tags.get("subtype", "road"), where) for where in (tags.get("location"), ""))
+    limit = next((GERMAN_KMH[kind] for kind in kinds if kind in GERMAN_KMH), None)
+    if limit is None or not tags.get("region", "de").lower().startswith("de"):
+        return None
+    osm.left_out["lanes with the speed limit of their kind of road in Germany"].append(key)
+    return limit / 3.6
 
 
 def _speed(text: str) -> float | None:
     """A speed limit [m/s], from a speed with its unit (km/h by default) or from a sign."""
+    if text.strip() == TOWN_SIGN:
+        return TOWN_KMH / 3.6
     if sign := GERMAN_LIMIT.match(text.strip()):
-        limit = int(sign[1])
-        return limit / 3.6 if limit == 5 or (0 < limit <= 130 and limit % 10 == 0) else None
+        limit = int(sign[1] or 30)
+        known = limit in (5, 15) or (0 < limit <= 130 and limit % 10 == 0)
+        return limit / 3.6 if known else None
     found = SPEED.match(text)
     return float(found[1]) * UNITS[found[2]] if found and float(found[1]) > 0 else None
 

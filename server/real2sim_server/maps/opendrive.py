@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ET
+from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,7 +18,7 @@ from ..geometry import Float
 from ..scene.lane import TRAVELLED, Area, Lane, Road, RoadLane, Signal, StopLine
 from ..scene.lane_graph import LaneGraph
 from .opendrive_roads import SPEED_UNITS, OpenDriveRoad, SectionLane, read_road
-from .reader import MapError, damage_named, head_of, integer, number, read_xml
+from .reader import MapError, damage_named, head_of, integer, notes_of, number, read_xml
 
 # --- Links ---------------------------------------------------------------------------------------
 
@@ -37,20 +38,32 @@ ENDS = {"predecessor": "start", "successor": "end"}
 
 
 def joined_ends(
-    roads: Mapping[str, OpenDriveRoad], junctions: list[ET.Element], file: str
+    roads: Mapping[str, OpenDriveRoad],
+    junctions: list[ET.Element],
+    file: str,
+    left_out: Mapping[str, list[str]],
 ) -> set[frozenset[LaneEnd]]:
     """Pairs of connected lane ends, independent of the direction of traffic.
 
-    Raises:
-        MapError: a junction refers to a missing road.
+    ``left_out`` receives the links to roads, junctions and lanes that are not there.
     """
     found: set[frozenset[LaneEnd]] = set()
     for road in roads.values():
         for pair in (*_within(road), *_to_roads(road, roads)):
             found.add(frozenset(pair))
     for junction in junctions:
-        for pair in _through(junction, roads, file):
+        for pair in _through(junction, roads, file, left_out):
             found.add(frozenset(pair))
+    named = {"road": set(roads), "junction": {j.get("id", "") for j in junctions}}
+    for road in roads.values():
+        beside = [("road", e.get("elementId", "")) for e in road.element.findall("link/neighbor")]
+        inside = [("junction", road.junction)] if road.junction is not None else []
+        given = [(link.kind, link.element) for link in road.links.values()]
+        left_out["links of roads to a road or junction that is not there"] += [
+            f"{road.road_id} to {name}"
+            for kind, name in (*given, *beside, *inside)
+            if name not in named.get(kind, {name})
+        ]
     there = {
         LaneEnd(r.road_id, i, n, end)
         for r in roads.values()
@@ -58,6 +71,9 @@ def joined_ends(
         for n in section.lanes
         for end in ("start", "end")
     }
+    left_out["lane links to a lane that is not there"] += sorted(
+        _key(end) for pair in found for end in pair - there
+    )
     return {pair for pair in found if len(pair) == 2 and pair <= there}
 
 
@@ -97,7 +113,10 @@ def _to_roads(
 
 
 def _through(
-    junction: ET.Element, roads: Mapping[str, OpenDriveRoad], file: str
+    junction: ET.Element,
+    roads: Mapping[str, OpenDriveRoad],
+    file: str,
+    left_out: Mapping[str, list[str]],
 ) -> Iterator[tuple[LaneEnd, LaneEnd]]:
     """Connections from incoming roads of a junction to its connecting roads."""
     name = junction.get("id", "")
@@ -107,9 +126,9 @@ def _through(
         crossing = connection.get("connectingRoad") or connection.get("linkedRoad")
         if incoming is None or crossing is None:
             continue
-        for road_id in (incoming, crossing):
-            if road_id not in roads:
-                raise MapError(f"{where}: names road {road_id!r}, which the file does not have")
+        if gone := [f"{name} to {road}" for road in (incoming, crossing) if road not in roads]:
+            left_out["connections of junctions to a road that is not there"] += gone
+            continue
         contact = connection.get("contactPoint", "start")
         leaves = _facing_end(roads[incoming], roads[crossing], contact, name)
         for link in connection.findall("laneLink"):
@@ -145,11 +164,15 @@ REACH_M = 25.0
 
 
 def read_signals(
-    roads: Mapping[str, OpenDriveRoad], lines: Mapping[str, Road], file: str
+    roads: Mapping[str, OpenDriveRoad],
+    lines: Mapping[str, Road],
+    file: str,
+    left_out: Mapping[str, list[str]],
 ) -> tuple[list[Signal], list[StopLine]]:
     """All signals of a file with the lanes that they control, and its stop lines.
 
-    A signal without <validity> controls every lane of the direction that it faces.
+    A signal without <validity> controls every lane of the direction that it faces. ``left_out``
+    receives references to signals that are not there.
 
     Raises:
         MapError: an attribute is absent or no number.
@@ -169,10 +192,18 @@ def read_signals(
             stop_lines[name] = _stop_line(name, element, roads[road_id], lines[road_id], file)
     for road_id, element, refers in placed:
         own = declared.get(element.get("id", "")) if refers else element
+        if own is None:
+            name = f"{element.get('id', '')} on road {road_id}"
+            left_out["references to a signal that is not there"].append(name)
         if own is None or own.get("type", "") in STOP_LINE_TYPES:
             continue
         signal_id = own.get("id", "")
         lanes = _ruled(element, roads[road_id], lines[road_id], file)
+        spans = _spans(element, f"{file}: signal {signal_id!r}")
+        numbers = {0, *(n for section in roads[road_id].sections for n in section.lanes)}
+        if spans and not any(min(a, b) <= n <= max(a, b) for a, b in spans for n in numbers):
+            name = f"{signal_id} on road {road_id}"
+            left_out["signals for lanes that are not there"].append(name)
         if refers and signal_id in signals:
             known = signals[signal_id]
             signals[signal_id] = _joined(known, lanes)
@@ -186,10 +217,7 @@ def read_signals(
 def _ruled(element: ET.Element, road: OpenDriveRoad, line: Road, file: str) -> tuple[str, ...]:
     where = f"{file}: signal {element.get('id', '')!r}"
     s = min(max(number(element, "s", where), 0.0), line.length)
-    spans = [
-        (integer(v, "fromLane", where), integer(v, "toLane", where))
-        for v in element.findall("validity")
-    ]
+    spans = _spans(element, where)
     facing = element.get("orientation", "none")
     found = []
     for part in line.lanes:
@@ -209,6 +237,14 @@ def _ruled(element: ET.Element, road: OpenDriveRoad, line: Road, file: str) -> t
         if (part.s[0] < known.s[0]) == line.runs_along(part.number):
             waits[part.number] = part
     return tuple(part.lane_id for part in waits.values())
+
+
+def _spans(element: ET.Element, where: str) -> list[tuple[int, int]]:
+    """First and last lanes of each <validity>."""
+    return [
+        (integer(v, "fromLane", where), integer(v, "toLane", where))
+        for v in element.findall("validity")
+    ]
 
 
 def _is_travelled(road: OpenDriveRoad, s: float, lane: int) -> bool:
@@ -364,19 +400,21 @@ class _Build:
     root: ET.Element
     roads: dict[str, OpenDriveRoad]
     lines: dict[str, Road]
+    left_out: Mapping[str, list[str]]
 
     @classmethod
     def of(cls, root: ET.Element, file: str) -> _Build:
-        _check_version(root, file)
+        left_out: Mapping[str, list[str]] = defaultdict(list)
+        _check_version(root, file, left_out)
         roads: dict[str, OpenDriveRoad] = {}
         for element in root.findall("road"):
-            road = read_road(element, file)
+            road = read_road(element, file, left_out)
             if road.road_id in roads:
                 raise MapError(f"{file}: road {road.road_id!r} is there twice")
             roads[road.road_id] = road
         if not roads:
             raise MapError(f"{file}: has no <road>")
-        return cls(file, root, roads, {k: _line(r) for k, r in roads.items()})
+        return cls(file, root, roads, {k: _line(r) for k, r in roads.items()}, left_out)
 
     def graph(self, name: str) -> LaneGraph:
         made = (
@@ -391,7 +429,7 @@ class _Build:
             raise MapError(f"{self.file}: none of its lanes has a width")
         found = self._joined(self._beside(found))
         lines = {k: self._with_lanes(k, found) for k, road in self.lines.items()}
-        signals, stop_lines = read_signals(self.roads, lines, self.file)
+        signals, stop_lines = read_signals(self.roads, lines, self.file, self.left_out)
         return LaneGraph.of(
             found.values(),
             areas=read_crossings(self.roads, lines, self.file),
@@ -400,6 +438,7 @@ class _Build:
             roads=lines.values(),
             source=f"opendrive {name}",
             geo_reference=_geo_reference(self.root, self.file),
+            notes=notes_of(self.left_out),
         )
 
     def _lane(self, road: OpenDriveRoad, index: int, lane: SectionLane) -> Lane | None:
@@ -439,7 +478,8 @@ class _Build:
 
     def _joined(self, lanes: dict[str, Lane]) -> dict[str, Lane]:
         onward: dict[str, list[str]] = {key: [] for key in lanes}
-        pairs = joined_ends(self.roads, self.root.findall("junction"), self.file)
+        junctions = self.root.findall("junction")
+        pairs = joined_ends(self.roads, junctions, self.file, self.left_out)
         for pair in sorted(sorted(p) for p in pairs):
             for a, b in (pair, pair[::-1]):
                 before, after = _key(a), _key(b)
@@ -538,12 +578,14 @@ def _may_cross(lanes: dict[int, SectionLane], own: int, other: int) -> bool:
     return nearer.may_increase if other > own else nearer.may_decrease
 
 
-def _check_version(root: ET.Element, file: str) -> None:
+def _check_version(root: ET.Element, file: str, left_out: Mapping[str, list[str]]) -> None:
     header = root.find("header")
-    if header is None:
-        raise MapError(f"{file}: has no <header>")
-    major, minor = header.get("revMajor", ""), header.get("revMinor", "")
-    if major != "1" or not minor.isdecimal() or int(minor) < 1:
+    major, minor = (
+        None if header is None else header.get(name) for name in ("revMajor", "revMinor")
+    )
+    if major is None and minor is None:
+        left_out["headers without a version, read as OpenDRIVE 1.8"].append("<header>")
+    elif major != "1" or not (minor or "").isdecimal() or int(minor or "") < 1:
         raise MapError(
             f"{file}: is of OpenDRIVE {major or '?'}.{minor or '?'}; 1.4 to 1.8 can be read"
         )

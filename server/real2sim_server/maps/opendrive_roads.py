@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
@@ -222,6 +222,10 @@ def _param_poly3(element: ET.Element, length: float, where: str) -> Local:
 
 # Cubic polynomials over s: elevation, superelevation, lane offset, widths.
 
+SAME_START_M = 0.01
+"""Records of a lane closer than this start at the same place."""
+STEP_T_M = 0.01
+
 
 @dataclass(frozen=True)
 class Profile:
@@ -235,35 +239,54 @@ class Profile:
     starts: Float
     rows: Float
 
-    def at(self, s: Float, *, until: float = np.inf) -> Float:
-        """Values [K] at positions ``s`` [K]; a record that starts at ``until`` is ignored, so that
-        ends of sections keep their own values.
+    def at(self, s: Float, *, since: float = -np.inf, until: float = np.inf) -> Float:
+        """Values [K] at positions ``s`` [K] of a section from ``since`` to ``until``. A record that
+        starts within a centimetre of either applies from there on, so that a section keeps its own
+        values up to its ends.
         """
         if not len(self.starts):
             return np.zeros_like(s)
-        looked_up = np.minimum(s, until - 1e-9)
+        looked_up = np.minimum(np.maximum(s, since + SAME_START_M), until - SAME_START_M)
         k = np.searchsorted(self.starts, looked_up + 1e-12, side="right") - 1
         before = k < 0
         a, b, c, d = self.rows[np.maximum(k, 0)].T
         x = s - self.starts[np.maximum(k, 0)]
         return np.where(before, 0.0, a + x * (b + x * (c + x * d)))
 
+    def steps(self) -> Iterator[float]:
+        """Positions where the value jumps by more than a centimetre [m]."""
+        before = np.zeros(4)
+        for k, (start, row) in enumerate(zip(self.starts.tolist(), self.rows, strict=True)):
+            passed = start - self.starts[k - 1] if k else 0.0
+            if abs(np.polynomial.polynomial.polyval(passed, before) - row[0]) > STEP_T_M:
+                yield start
+            before = row
+
 
 def read_profile(
-    elements: Iterable[ET.Element], where: str, *, start: str = "s", base: float = 0.0
+    elements: Iterable[ET.Element],
+    where: str,
+    *,
+    start: str = "s",
+    base: float = 0.0,
+    shortest: float = 0.0,
 ) -> Profile:
     """The profile of elements with attributes ``start``, a, b, c and d; ``base`` [m] is added to
-    their starts.
+    their starts. The record before one that lasts less than ``shortest`` [m] applies in its place.
 
     Raises:
         MapError: an attribute is missing or not a number.
     """
     rows = [[number(e, name, where) for name in (start, "a", "b", "c", "d")] for e in elements]
     table = np.array(sorted(rows, key=lambda row: row[0])).reshape(-1, 5)
+    if len(table):
+        table = table[np.append(np.diff(table[:, 0]) >= shortest, True)]
     return Profile(table[:, 0] + base, table[:, 1:])
 
 
 STEP_M, BENT_STEP_M = 2.0, 0.5
+JUMP_M = 1e-3
+"""Length of a step of a border, and of the straight pieces before and after it."""
 MAX_SAMPLES = 4_000_000
 SAME_S = 1e-6
 
@@ -371,8 +394,8 @@ class OpenDriveRoad:
         return f"road {self.road_id!r}"
 
 
-def read_road(element: ET.Element, file: str) -> OpenDriveRoad:
-    """A road of a file.
+def read_road(element: ET.Element, file: str, left_out: Mapping[str, list[str]]) -> OpenDriveRoad:
+    """A road of a file; ``left_out`` receives its name for a note on its length.
 
     Raises:
         MapError: names the file, the road and the problem.
@@ -380,12 +403,9 @@ def read_road(element: ET.Element, file: str) -> OpenDriveRoad:
     road_id = element.get("id", "")
     where = f"{file}: road {road_id!r}"
     plan = read_plan_view(element, where)
-    length = number(element, "length", where)
-    if abs(length - plan.length) > max(0.1, 1e-3 * length):
-        raise MapError(
-            f"{where}: is {length} m long, its geometry {plan.length:.3f} m; they must agree"
-        )
     length = plan.length
+    if not abs(number(element, "length", where, math.inf) - length) <= max(0.1, 1e-3 * length):
+        left_out["roads with another length than their geometry, which is used"].append(road_id)
     junction = element.get("junction", "-1")
     road = OpenDriveRoad(
         road_id=road_id,
@@ -402,13 +422,24 @@ def read_road(element: ET.Element, file: str) -> OpenDriveRoad:
     )
     starts = _section_starts(element, length, where)
     road.s = _sample_places(element, plan, length, [s for s, _ in starts], where)
-    offset = read_profile(element.findall("lanes/laneOffset"), where)
+    offset = _lateral(element.findall("lanes/laneOffset"), where)
     ends = [s for s, _ in starts[1:]] + [length]
-    for (start, section), end in zip(starts, ends, strict=True):
+    for (start, sides), end in zip(starts, ends, strict=True):
         s = road.s[(road.s >= start - SAME_S) & (road.s <= end + SAME_S)]
-        stretch = _Stretch(road, start, end, s, offset.at(s, until=end), where)
-        road.sections.append(_read_section(section, stretch))
+        middle = offset.at(s, since=start, until=end)
+        stretch = _Stretch(road, start, end, s, middle, where)
+        road.sections.append(_read_section(sides, stretch))
+    _continue_sides(road.sections, [sides for _, sides in starts])
     return road
+
+
+def _continue_sides(sections: list[Section], sides: list[Sides]) -> None:
+    """Connect the lanes of a side with themselves where a section keeps it from the one before."""
+    for (before, old), (after, new) in pairwise(zip(sections, sides, strict=True)):
+        for n, lane in after.lanes.items():
+            side = 1 if n > 0 else -1
+            if new[side] == old.get(side):
+                before.lanes[n].links["successor"] = lane.links["predecessor"] = n
 
 
 def _links(element: ET.Element) -> dict[str, Link]:
@@ -424,9 +455,14 @@ def _links(element: ET.Element) -> dict[str, Link]:
     return found
 
 
-def _section_starts(
-    element: ET.Element, length: float, where: str
-) -> list[tuple[float, ET.Element]]:
+Sides = dict[int, tuple[ET.Element, float]]
+"""<laneSection> that has the lanes of a side (-1: right, 1: left), and its start [m]."""
+
+
+def _section_starts(element: ET.Element, length: float, where: str) -> list[tuple[float, Sides]]:
+    """Start of each section, with its sides. A section with ``singleSide`` keeps the other side of
+    the section before it.
+    """
     sections = element.findall("lanes/laneSection")
     if not sections:
         raise MapError(f"{where}: has no <laneSection>")
@@ -435,9 +471,17 @@ def _section_starts(
     if found[0][0] > 0.01:
         raise MapError(f"{where}: its first lane section starts at s = {found[0][0]}, not at 0")
     found[0] = (0.0, found[0][1])
+    full: list[tuple[float, Sides]] = []
+    for start, section in found:
+        kept = section.get("singleSide") in ("true", "1") and full
+        sides = dict(full[-1][1]) if kept else {}
+        for lane in section.iter("lane"):
+            if (n := integer(lane, "id", where)) != 0:
+                sides[1 if n > 0 else -1] = (section, start)
+        full.append((start, sides))
     ends = [s for s, _ in found[1:]] + [length]
     # Sections without length cannot be driven on; files have them at ends of roads.
-    return [f for f, end in zip(found, ends, strict=True) if end - f[0] > SAME_S]
+    return [f for f, end in zip(full, ends, strict=True) if end - f[0] > SAME_S]
 
 
 def _sample_places(
@@ -448,11 +492,17 @@ def _sample_places(
     for record in element.iter():
         if record.tag in ("elevation", "superelevation", "laneOffset", "geometry"):
             breaks.add(number(record, "s", where))
+    steps = set(_lateral(element.findall("lanes/laneOffset"), where).steps())
     for section in element.findall("lanes/laneSection"):
         base = number(section, "s", where)
-        for record in section.iter():
-            if record.tag in ("width", "border"):
-                breaks.add(base + number(record, "sOffset", where, 0.0))
+        for lane in section.iter("lane"):
+            for tag in ("width", "border"):
+                records = lane.findall(tag)
+                breaks |= {base + number(r, "sOffset", where, 0.0) for r in records}
+                steps |= set(_lateral(records, where, start="sOffset", base=base).steps())
+    for s in steps:
+        if min(abs(s - section) for section in (*sections, length)) > SAME_START_M:
+            breaks |= {s - 2 * JUMP_M, s - JUMP_M, s, s + JUMP_M}
     wide = bool(element.findall("lanes/laneOffset")) or any(
         any(float(w.get(n, "0") or 0) != 0 for n in "bcd")
         for tag in ("width", "border")
@@ -473,9 +523,19 @@ def _sample_places(
     return found
 
 
+def _lateral(
+    elements: list[ET.Element], where: str, *, start: str = "s", base: float = 0.0
+) -> Profile:
+    """The profile of a lane offset, width or border; a step between two records is one step."""
+    return read_profile(elements, where, start=start, base=base, shortest=SAME_START_M)
+
+
 @dataclass(frozen=True)
 class _Stretch:
-    """Geometry of a lane section: its road, the sampled positions, t of its centre line."""
+    """Geometry of a lane section: its road, the sampled positions, t of its centre line.
+
+    ``base`` is the start of the <laneSection> with the lanes, from which their offsets count [m].
+    """
 
     road: OpenDriveRoad
     start: float
@@ -483,22 +543,24 @@ class _Stretch:
     s: Float
     middle: Float
     where: str
+    base: float = 0.0
 
     def profile(self, elements: list[ET.Element]) -> Float:
         """Values [M] of records that begin at their ``sOffset``."""
-        records = read_profile(elements, self.where, start="sOffset", base=self.start)
-        return records.at(self.s, until=self.end)
+        records = _lateral(elements, self.where, start="sOffset", base=self.base)
+        return records.at(self.s, since=self.start, until=self.end)
 
 
-def _read_section(element: ET.Element, at: _Stretch) -> Section:
-    section = Section(at.s)
-    by_number: dict[int, ET.Element] = {}
-    for lane in element.iter("lane"):
-        index = integer(lane, "id", at.where)
-        if index in by_number:
-            raise MapError(f"{at.where}: lane {index} is there twice at s = {at.start}")
-        by_number[index] = lane
-    for side in (-1, 1):
+def _read_section(sides: Sides, stretch: _Stretch) -> Section:
+    section = Section(stretch.s)
+    for side, (element, base) in sorted(sides.items()):
+        at = replace(stretch, base=base)
+        by_number: dict[int, ET.Element] = {}
+        for lane in element.iter("lane"):
+            index = integer(lane, "id", at.where)
+            if index in by_number:
+                raise MapError(f"{at.where}: lane {index} is there twice at s = {at.start}")
+            by_number[index] = lane
         inner = at.middle
         for n in sorted((n for n in by_number if n * side > 0), key=abs):
             outer = _outer(by_number[n], inner, side, at)
@@ -522,7 +584,7 @@ def _section_lane(lane: ET.Element, n: int, rims: tuple[Float, Float], at: _Stre
         found = lane.find(f"link/{link}")
         if found is not None:
             links[link] = integer(found, "id", at.where)
-    mark = lane.find("roadMark")
+    mark = _road_mark(lane, at)
     change = "both"
     if mark is not None:
         solid = "solid" in mark.get("type", "") and mark.get("type") != "broken solid"
@@ -541,10 +603,21 @@ def _section_lane(lane: ET.Element, n: int, rims: tuple[Float, Float], at: _Stre
     )
 
 
+def _road_mark(lane: ET.Element, at: _Stretch) -> ET.Element | None:
+    """The mark at the start of the section, otherwise the first one."""
+    marks = lane.findall("roadMark")
+    if at.base < at.start:
+        passed = [
+            m for m in marks if at.base + number(m, "sOffset", at.where, 0.0) <= at.start + SAME_S
+        ]
+        marks = passed[-1:] or marks
+    return marks[0] if marks else None
+
+
 def _speed_limit(lane: ET.Element, at: _Stretch) -> float | None:
     """Speed limit of the lane at the middle of its section, otherwise of the road there."""
     where, middle = at.where, (at.start + at.end) / 2
-    own = [(at.start + number(e, "sOffset", where, 0.0), e) for e in lane.findall("speed")]
+    own = [(at.base + number(e, "sOffset", where, 0.0), e) for e in lane.findall("speed")]
     types = [(number(e, "s", where), e) for e in at.road.element.findall("type")]
     of_road = [(s, speed) for s, e in types if (speed := e.find("speed")) is not None]
     for records in (own, of_road):

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import codecs
 import json
 import math
+import re
 import xml.etree.ElementTree as ET
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -66,6 +68,20 @@ def damage_named(where: str) -> Iterator[None]:
         raise MapError(f"{where}: is damaged, or not as its format asks ({reason})") from error
 
 
+# --- Notes ---------------------------------------------------------------------------------------
+
+
+def notes_of(left_out: Mapping[str, Iterable[str]]) -> tuple[str, ...]:
+    """Notes on names by kind: one sentence a kind, with the number of names and the first five."""
+    notes = []
+    for kind, given in left_out.items():
+        if not (names := list(dict.fromkeys(given))):
+            continue
+        first = ", ".join(name[:60] for name in names[:5])
+        notes.append(f"{kind}: {len(names)} ({first}{', ...' if len(names) > 5 else ''})")
+    return tuple(notes)
+
+
 # --- JSON ----------------------------------------------------------------------------------------
 
 MAX_BYTES = 512 << 20
@@ -95,6 +111,10 @@ def read_json(path: Path) -> dict[str, Any]:
 # Files are untrusted.
 
 
+_DECLARATION = re.compile(r"<\?xml\s.*?\?>", re.DOTALL)
+_BEFORE_DECLARATION = re.compile(rb"(?:\xef\xbb\xbf)?(?>\s+|<!--.*?-->)++(?=<\?xml\s)", re.DOTALL)
+
+
 def read_xml(path: Path, root: str) -> ET.Element:
     """The root element of an XML file.
 
@@ -111,6 +131,10 @@ def read_xml(path: Path, root: str) -> ET.Element:
         data = path.read_bytes()
     except OSError as error:
         raise MapError(f"{path}: cannot be read ({error.strerror})") from error
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        data = _DECLARATION.sub("", data.decode("utf-16", "replace")).encode()
+    if before := _BEFORE_DECLARATION.match(data):
+        data = data[before.end() :]
     # Entities could expand a small file until it fills the memory; maps do not need them.
     if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
         raise MapError(f"{path}: declares a document type or entities; maps have none")
@@ -118,8 +142,13 @@ def read_xml(path: Path, root: str) -> ET.Element:
         found = ET.fromstring(data)
     except (ET.ParseError, ValueError, LookupError) as error:
         raise MapError(f"{path}: is not an XML file ({error})") from error
-    if found.tag != root:
-        raise MapError(f"{path}: its root is <{found.tag}>, expected <{root}>")
+    # Elements of other namespaces, such as those in <userData>, keep them and are not read.
+    namespace, brace, tag = found.tag.rpartition("}")
+    if brace:
+        for element in found.iter():
+            element.tag = element.tag.removeprefix(namespace + brace)
+    if tag != root:
+        raise MapError(f"{path}: its root is <{tag}>, expected <{root}>")
     return found
 
 
@@ -163,6 +192,12 @@ def integer(element: ET.Element, name: str, where: str) -> int:
 
 STEP_M = 1.0
 SAME_PLACE_M = 1e-3
+FIT_M = 0.03
+"""Accepted distance between the borders of a lane and the given ones."""
+CORNER = math.radians(3.0)
+"""Smaller turns of a centre line are not kept exactly."""
+MAX_COMPARED = 2_000_000
+"""Points times segments of a lane whose nearest points are looked for, which takes a second."""
 
 
 def between(left: Float, right: Float) -> tuple[Float, Float] | None:
@@ -170,6 +205,8 @@ def between(left: Float, right: Float) -> tuple[Float, Float] | None:
     they have no length.
 
     Both borders are traversed in parallel, by their share of length, as in Lanelet2 and Argoverse.
+    If the borders of the result leave the given ones, as beside kinks, nearest points are paired,
+    unless the lane is a kilometre long with points every metre.
     """
     if len(left) < 2 or len(right) < 2:
         return None
@@ -178,25 +215,110 @@ def between(left: Float, right: Float) -> tuple[Float, Float] | None:
         left[0] - right[-1]
     ) + np.linalg.norm(left[-1] - right[0]):
         right = right[::-1]
-    rims = (left, right)
-    lengths = [float(np.linalg.norm(np.diff(r[:, :2], axis=0), axis=1).sum()) for r in rims]
+    lengths = [float(_along(rim)[-1]) for rim in (left, right)]
     if max(lengths) < SAME_PLACE_M:
         return None
     count = max(int(np.ceil(max(lengths) / STEP_M)), 1) + 1
-    a, b = (_evenly(rim, count) for rim in (left, right))
+    a, b = (_at(r, np.linspace(0.0, s, count)) for r, s in zip((left, right), lengths, strict=True))
     centre, widths = (a + b) / 2, np.linalg.norm((a - b)[:, :2], axis=1)
-    kept = np.concatenate(
-        [[True], np.linalg.norm(np.diff(centre[:, :2], axis=0), axis=1) > SAME_PLACE_M]
-    )
-    return (centre[kept], widths[kept]) if kept.sum() > 1 else None
+    kept = _apart(centre)
+    even = (centre[kept], widths[kept]) if kept.sum() > 1 else None
+    if count * (len(left) + len(right)) > MAX_COMPARED:
+        return even
+    if (off := _misfit(even, left, right)) <= FIT_M:
+        return even
+    nearest = _paired(left, right)
+    return nearest if _misfit(nearest, left, right) < off else even
 
 
-def _evenly(line: Float, count: int) -> Float:
+def _along(line: Float) -> Float:
+    """Arc length of the points of a line, seen from above [m]."""
     steps = np.linalg.norm(np.diff(line[:, :2], axis=0), axis=1)
-    s = np.concatenate([[0.0], np.cumsum(steps)])
-    at = np.linspace(0.0, s[-1], count)
-    found: Float = np.column_stack([np.interp(at, s, line[:, i]) for i in range(3)])
-    return found
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def _at(line: Float, s: Float, known: Float | None = None) -> Float:
+    """Points [K, D] of a line at arc lengths [K]."""
+    known = _along(line) if known is None else known
+    return np.column_stack([np.interp(s, known, column) for column in line.T])
+
+
+def _apart(line: Float) -> Any:
+    """Which points of a line are not at the place of the one before."""
+    steps = np.linalg.norm(np.diff(line[:, :2], axis=0), axis=1)
+    return np.concatenate([[True], steps > SAME_PLACE_M])
+
+
+def _paired(left: Float, right: Float) -> tuple[Float, Float] | None:
+    """Centre line and widths from pairs of nearest points of both borders.
+
+    A corner has points on both sides at one distance, that of the feet of its inner border. It has
+    then the mean of both directions, and the corners of both borders stay where they are.
+    """
+    pairs = [np.zeros(2), np.array([_along(left)[-1], _along(right)[-1]])]
+    for rim, other, order in ((left, right, 1), (right, left, -1)):
+        known = _along(rim)
+        grid = np.linspace(0.0, known[-1], int(np.ceil(known[-1] / STEP_M)) + 1)
+        own = np.union1d(known, grid)
+        pairs += list(np.column_stack([own, _nearest(_at(rim, own), other)[0]])[:, ::order])
+    s_left, s_right = np.maximum.accumulate(sorted(pairs, key=sum), axis=0).T
+    ladder = np.column_stack([_at(left, s_left), _at(right, s_right)])
+    ladder = ladder[_apart(ladder[:, :3] + ladder[:, 3:])]
+    centre = (ladder[:, :3] + ladder[:, 3:]) / 2
+    s = _along(centre)
+    turns = np.diff(np.unwrap(np.arctan2(*np.diff(centre[:, :2], axis=0).T[::-1])))
+    k = np.flatnonzero(np.abs(turns) > CORNER) + 1
+    corners = np.concatenate([[0.0], s[k], s[-1:]])
+    half = np.linalg.norm(ladder[k, :2] - ladder[k, 3:5], axis=1) / 2
+    feet = half * np.sin(np.minimum(np.abs(turns[k - 1]), np.pi / 2) / 2)
+    gaps = np.diff(corners)
+    feet = np.concatenate([[0.0], np.minimum(feet, np.minimum(gaps[1:], gaps[:-1])), [0.0]])
+    places = [corners]
+    for a, b in zip((corners + feet)[:-1], (corners - feet)[1:], strict=True):
+        if a <= b:
+            places.append(np.linspace(a, b, int((b - a) / STEP_M) + 2))
+    ladder = _at(ladder, np.unique(np.concatenate(places)), s)
+    ladder = ladder[_apart((ladder[:, :3] + ladder[:, 3:]) / 2)]
+    if len(ladder) < 2:
+        return None
+    centre, rungs = (ladder[:, :3] + ladder[:, 3:]) / 2, ladder[:, :3] - ladder[:, 3:]
+    heading = Lane("", "driving", centre, np.zeros(len(centre))).headings
+    across = np.column_stack([-np.sin(heading), np.cos(heading)])
+    return centre, np.abs((rungs[:, :2] * across).sum(axis=1))
+
+
+def _nearest(points: Float, line: Float) -> tuple[Float, Float]:
+    """Arc lengths [K] of the points of a line nearest to ``points`` [K, D], and distances [K]."""
+    start, step = line[:-1], np.diff(line, axis=0)
+    squares, known = np.maximum((step * step).sum(axis=1), 1e-12), _along(line)
+    found = np.empty((2, len(points)))
+    for first in range(0, len(points), 256):  # bounds the memory for long lines
+        rest = points[first : first + 256, None] - start
+        share = np.clip((rest * step).sum(axis=2) / squares, 0.0, 1.0)
+        distances = np.linalg.norm(rest - share[..., None] * step, axis=2)
+        k = distances.argmin(axis=1)[:, None]
+        share, distances = (np.take_along_axis(a, k, 1)[:, 0] for a in (share, distances))
+        k = k[:, 0]
+        found[:, first : first + 256] = known[k] + share * (known[k + 1] - known[k]), distances
+    return found[0], found[1]
+
+
+def _misfit(shape: tuple[Float, Float] | None, left: Float, right: Float) -> float:
+    """Largest distance between the borders of a shape and the given ones [m]. Lines go on straight
+    beyond their ends, because lanes end at a right angle and given borders need not.
+    """
+    if shape is None:
+        return math.inf
+    off = 0.0
+    for pair in zip(Lane("", "driving", *shape).rims, (left, right), strict=True):
+        rim, given = (line[_apart(line), :2] for line in pair)
+        if min(len(rim), len(given)) < 2:  # the borders meet in a point
+            continue
+        for points, line in ((rim, given), (given, rim)):
+            ends = line[[0, -1]] + (line[[0, -1]] - line[[1, -2]]) * 1e3
+            long = np.concatenate([ends[:1], line, ends[1:]])
+            off = max(off, float(_nearest(points, long)[1].max()))
+    return off
 
 
 def joined(lanes: Iterable[Lane], **parts: Any) -> LaneGraph:

@@ -31,13 +31,32 @@ SHAPES = {
 }
 
 
-def one_road(tmp_path, geometry, length, *, offset="", more=""):
+STRAIGHT = '<geometry s="0" x="0" y="0" hdg="0" length="100"><line/></geometry>'
+
+
+def one_road(tmp_path, geometry, length, *, offset="", more="", lanes=LANES, header=HEADER):
     path = tmp_path / "map.xodr"
     path.write_text(
-        f'<OpenDRIVE>{HEADER}<road id="7" length="{length!r}" junction="-1"><planView>'
-        f"{geometry}</planView>{LANES.format(offset=offset)}{more}</road></OpenDRIVE>"
+        f'<OpenDRIVE>{header}<road id="7" length="{length!r}" junction="-1"><planView>'
+        f"{geometry}</planView>{lanes.format(offset=offset)}{more}</road></OpenDRIVE>"
     )
     return path
+
+
+def lane(number, *widths, links="", kind="driving"):
+    """A lane with widths (sOffset, a, b)."""
+    records = "".join(
+        f'<width sOffset="{s}" a="{a}" b="{b}" c="0" d="0"/>' for s, a, b in widths or [(0, 3, 0)]
+    )
+    return f'<lane id="{number}" type="{kind}"><link>{links}</link>{records}</lane>'
+
+
+def section(s, left="", right="", single=""):
+    given = f' singleSide="{single}"' if single else ""
+    sides = "".join(
+        f"<{side}>{lanes}</{side}>" for side, lanes in (("left", left), ("right", right)) if lanes
+    )
+    return f'<laneSection s="{s}"{given}>{sides}</laneSection>'
 
 
 def integrated(start, end, length, d):
@@ -146,6 +165,125 @@ def test_signals_rule_the_lanes_that_they_face_and_find_their_stop_line(tmp_path
     assert light.stop_line == "7/w"
     np.testing.assert_allclose(graph.stop_lines["7/w"].points[:, 0], 88.0)
     assert (limit.lanes, limit.value) == (("7.0.-2",), pytest.approx(30 / 3.6))
+
+
+@pytest.mark.parametrize("header", ["", '<header name="m"/>'])
+def test_a_file_without_a_version_is_read_with_a_note(tmp_path, header):
+    graph = read_map(one_road(tmp_path, STRAIGHT, 100.0, header=header))
+    assert len(graph.lanes) == 3
+    assert "headers without a version" in graph.notes[0]
+
+
+@pytest.mark.parametrize("given", ["", 'length="250"'])
+def test_the_geometry_counts_where_a_road_has_another_length(tmp_path, given):
+    path = one_road(tmp_path, STRAIGHT, 99.0)
+    path.write_text(path.read_text().replace('length="99.0"', given))
+    graph = read_map(path)
+    assert graph.road("7").length == 100
+    assert graph.notes == ("roads with another length than their geometry, which is used: 1 (7)",)
+
+
+def test_references_to_absent_parts_are_noted_once_per_kind(tmp_path):
+    links = (
+        '<link><predecessor elementType="road" elementId="8" contactPoint="end"/>'
+        '<successor elementType="junction" elementId="9"/>'
+        '<neighbor side="left" elementId="12" direction="same"/></link>'
+    )
+    signals = (
+        '<signals><signalReference id="s" s="5" t="0" orientation="+"/>'
+        '<signal id="v" s="5" t="0" orientation="+" type="205"><validity fromLane="3" toLane="4"/>'
+        "</signal></signals>"
+    )
+    sections = section(0, right=lane(-1, links='<successor id="-4"/>'))
+    lanes = f"<lanes>{sections}{section(50, right=lane(-1))}</lanes>"
+    path = one_road(tmp_path, STRAIGHT, 100.0, lanes=lanes, more=links + signals)
+    junction = "".join(
+        f'<connection id="{i}" incomingRoad="7" connectingRoad="{road}" contactPoint="start">'
+        f'<laneLink from="-1" to="-1"/></connection>'
+        for i, road in enumerate(range(20, 27))
+    )
+    end = f'<junction id="3">{junction}</junction></OpenDRIVE>'
+    path.write_text(path.read_text().replace("</OpenDRIVE>", end))
+    graph = read_map(path)
+    assert set(graph.lanes) == {"7.0.-1", "7.1.-1"}
+    assert graph.notes == (
+        "connections of junctions to a road that is not there: 7 "
+        "(3 to 20, 3 to 21, 3 to 22, 3 to 23, 3 to 24, ...)",
+        "links of roads to a road or junction that is not there: 3 (7 to 8, 7 to 9, 7 to 12)",
+        "lane links to a lane that is not there: 1 (7.1.-4)",
+        "signals for lanes that are not there: 1 (v on road 7)",
+        "references to a signal that is not there: 1 (s on road 7)",
+    )
+
+
+def test_a_section_of_one_side_keeps_the_lanes_of_the_other_side(tmp_path):
+    """Their widths go on from the section that has them, and they continue into themselves."""
+    ahead = '<successor id="-1"/>'
+    lanes = "".join(
+        (
+            section(0, left=lane(1, (0, 3, 0.01)), right=lane(-1, links=ahead)),
+            section(40, right=lane(-1) + lane(-2), single="true"),
+            section(70, left=lane(1) + lane(2), single="true"),
+        )
+    )
+    graph = read_map(one_road(tmp_path, STRAIGHT, 100.0, lanes=f"<lanes>{lanes}</lanes>"))
+    assert list(graph.lanes) == [
+        "7.0.-1", "7.0.1", "7.1.-1", "7.1.-2", "7.1.1", "7.2.-1", "7.2.-2", "7.2.1", "7.2.2"
+    ]  # fmt: skip
+    assert graph.road("7").lane(1, 55.0).width(55.0) == pytest.approx(3.55)
+    assert graph.road("7").lane(1, 80.0).width(80.0) == pytest.approx(3.0)
+    onward = {name: lane.successors for name, lane in graph.lanes.items() if lane.successors}
+    assert onward == {
+        "7.0.-1": ("7.1.-1",),
+        "7.1.-1": ("7.2.-1",),
+        "7.1.-2": ("7.2.-2",),
+        "7.1.1": ("7.0.1",),
+    }
+    assert graph.lane("7.1.-1").opposite == "7.1.1"
+
+
+def test_both_sides_may_begin_in_a_section_of_their_own(tmp_path):
+    lanes = section(0, left=lane(1), single="true") + section(0, right=lane(-1), single="true")
+    graph = read_map(one_road(tmp_path, STRAIGHT, 100.0, lanes=f"<lanes>{lanes}</lanes>"))
+    assert set(graph.lanes) == {"7.0.1", "7.0.-1"}
+
+
+@pytest.mark.parametrize("before", ["", '<laneOffset s="50.39" a="0" b="500" c="0" d="0"/>'])
+def test_a_step_of_the_lane_offset_is_a_step(tmp_path, before):
+    """With one record or two that are 4 mm apart; its borders are straight up to the step."""
+    offset = (
+        f'<laneOffset s="0" a="0" b="0" c="0" d="0"/>{before}'
+        '<laneOffset s="50.394" a="1.83" b="0" c="0" d="0"/>'
+    )
+    lanes = f"<lanes>{{offset}}{section(0, right=lane(-1))}</lanes>"
+    graph = read_map(one_road(tmp_path, STRAIGHT, 100.0, lanes=lanes, offset=offset))
+    for s, t in ((50.0, 0), (50.391, 0), (50.396, 1.83), (50.8, 1.83)):
+        assert graph.road("7").on_lane(-1, s)[1] == pytest.approx(t - 1.5, abs=1e-9)
+    left, right = graph.lane("7.0.-1").rims
+    for rim, t in ((left, 0.0), (right, -3.0)):
+        away = np.minimum(np.abs(rim[:, 1] - t), np.abs(rim[:, 1] - t - 1.83))
+        assert away.max() < 0.01
+        assert np.abs(rim[:, 0] - graph.lane("7.0.-1").centre[:, 0]).max() < 0.01
+
+
+def test_a_step_of_a_width_is_a_step(tmp_path):
+    lanes = f"<lanes>{section(0, right=lane(-1, (0, 3, 0), (50.4, 4, 0)))}</lanes>"
+    road = read_map(one_road(tmp_path, STRAIGHT, 100.0, lanes=lanes)).road("7")
+    widths = [road.lane(-1, s).width(s) for s in (50.0, 50.397, 50.402)]
+    assert widths == pytest.approx([3.0, 3.0, 4.0])
+
+
+def test_a_lane_offset_changes_at_the_border_of_its_section(tmp_path):
+    """Although its record starts some millimetres after or before the section."""
+    ahead = '<successor id="-2"/>'
+    for start in (50.004, 49.996):
+        offset = f'<laneOffset s="{start}" a="3" b="0" c="0" d="0"/>'
+        sections = section(0, right=lane(-1, links=ahead))
+        sections += section(50, right=lane(-1) + lane(-2))
+        lanes = f"<lanes>{offset}{sections}</lanes>"
+        graph = read_map(one_road(tmp_path, STRAIGHT, 100.0, lanes=lanes))
+        assert graph.gaps == {("7.0.-1", "7.1.-2"): pytest.approx(0.0, abs=1e-9)}
+        assert np.ptp(graph.lane("7.1.-2").centre[:, 1]) < 1e-9
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,8 @@ from typer.testing import CliRunner
 
 from real2sim.cli import build_app
 from real2sim_server.maps import MAP_READERS, MapError, read_map
+from real2sim_server.maps.reader import between
+from real2sim_server.scene import Lane
 from real2sim_server.scene.io import save_scene
 from real2sim_server.scene.io.document import lane_document
 
@@ -148,6 +151,40 @@ def test_every_reader_passes_the_contract(reader, tmp_path):
         read_map(path, format=reader.name)
 
 
+DECLARATION = '<?xml version="1.0" encoding="UTF-8"?>'
+
+
+@pytest.mark.parametrize("name", ["opendrive", "lanelet2"])
+@pytest.mark.parametrize(
+    ("before", "encoding"),
+    [
+        (f"<!-- made by hand -->\n{DECLARATION}", "utf-8"),
+        (f"\n\n  {DECLARATION}", "utf-8"),
+        (f"\n<!-- one --> <!-- two -->{DECLARATION}<!-- three -->", "utf-8-sig"),
+        (f"<!-- made by hand -->{DECLARATION.replace('UTF-8', 'UTF-16')}", "utf-16"),
+    ],
+)
+def test_comments_may_precede_the_xml_declaration(tmp_path, name, before, encoding):
+    path = globals()[f"written_{name}"](tmp_path)
+    lanes = read_map(path).lanes
+    path.write_text(before + path.read_text(), encoding=encoding)
+    assert list(read_map(path).lanes) == list(lanes)
+
+
+@pytest.mark.parametrize("name", ["opendrive", "lanelet2"])
+@pytest.mark.parametrize("prefix", ["", "m:"])
+def test_xml_namespaces_are_ignored(tmp_path, name, prefix):
+    """Elements of another namespace are not read as parts of the map."""
+    path = globals()[f"written_{name}"](tmp_path)
+    plain = lane_document(read_map(path))
+    text = re.sub(r"<(/?)(?=\w)", rf"<\1{prefix}", path.read_text())
+    declared = f"xmlns{':m' if prefix else ''}='http://example.org/map' xmlns:v='http://v.org'"
+    text = re.sub(r"^<\S+?(?=>)", rf"\g<0> {declared}", text)
+    text = text.replace(f"</{prefix}laneSection>", f"<v:lane id='9'/></{prefix}laneSection>")
+    path.write_text(text)
+    assert lane_document(read_map(path)) == plain
+
+
 def test_lanelets_are_joined_by_their_points_and_ruled_by_their_elements(tmp_path):
     graph = read_map(written_lanelet2(tmp_path))
     first, beside = graph.lane("21"), graph.lane("23")
@@ -205,11 +242,148 @@ def test_elements_marked_as_deleted_are_ignored(from_map):
     assert figures["notes"] == []
 
 
-@pytest.mark.parametrize("sign", ["de274-60", "de274.1-60", "60", "60 km/h"])
-def test_a_limit_given_by_a_sign_is_read(from_map, sign):
+@pytest.mark.parametrize("attribute", ['action="delete"', 'visible="false"'])
+def test_references_to_deleted_or_absent_elements_are_noted(tmp_path, attribute):
+    """The rest is read: a way without its deleted node, a lanelet without its rule."""
+    more = '<member type="relation" role="regulatory_element" ref="{}"/>'
+    osm = lanelet(1, more=more.format(8) + more.format(9)) + f'<relation id="8" {attribute}/>'
+    osm = osm.replace('<nd ref="100"/>', '<nd ref="100"/><nd ref="5"/><nd ref="6"/>', 1)
+    path = tmp_path / "map.osm"
+    path.write_text(f'<osm>{osm}<node id="5" lat="0" lon="0" {attribute}/></osm>')
+    graph = read_map(path)
+    assert graph.lane("l1").length == pytest.approx(40.0)
+    assert graph.notes == (
+        "ways read without nodes that are not there: 1 (10)",
+        "relations read without members that are not there: 2 "
+        "(l1 without relation 8, l1 without relation 9)",
+    )
+
+
+@pytest.mark.parametrize(
+    ("sign", "limit"),
+    [
+        ("de274-60", 60), ("de274.1-60", 60), ("60", 60), ("60 km/h", 60), ("de274-15", 15),
+        ("de274", 30), ("de274_1", 30), ("de274_1-20", 20), ("de310", 50),
+    ],
+)  # fmt: skip
+def test_a_limit_given_by_a_sign_is_read(from_map, sign, limit):
     lanes, figures, _ = from_map(limited_by(sign))
-    assert lanes[0]["speed_limit"] == pytest.approx(60 / 3.6)
+    assert lanes[0]["speed_limit"] == pytest.approx(limit / 3.6)
     assert figures["notes"] == []
+
+
+def tagged(osm, **tags):
+    """The OSM text with these tags on its lanelets."""
+    more = "".join(f'<tag k="{k.replace("__", ":")}" v="{v}"/>' for k, v in tags.items())
+    return osm.replace('<tag k="subtype" v="road"/>', more)
+
+
+def read_osm(folder, osm):
+    path = folder / "map.osm"
+    path.write_text(f"<osm>{osm}</osm>")
+    return read_map(path)
+
+
+def test_a_limit_comes_from_the_traffic_sign_that_a_rule_refers_to(tmp_path):
+    """Before the tags of the lanelet."""
+    member = '<member type="relation" role="regulatory_element" ref="9"/>'
+    rule = (
+        '<way id="8"><tag k="type" v="traffic_sign"/><tag k="subtype" v="de274-50"/></way>'
+        '<relation id="9"><member type="way" role="refers" ref="8"/>'
+        '<tag k="type" v="regulatory_element"/><tag k="subtype" v="speed_limit"/></relation>'
+    )
+    tags = {"subtype": "road", "location": "nonurban", "speed_limit": "70"}
+    graph = read_osm(tmp_path, tagged(lanelet(1, more=member), **tags) + rule)
+    assert graph.lane("l1").speed_limit == pytest.approx(50 / 3.6)
+    assert graph.notes == ()
+
+
+@pytest.mark.parametrize(
+    ("tags", "limit"),
+    [
+        ({"subtype": "road", "location": "urban"}, 50),
+        ({"subtype": "road", "location": "nonurban"}, 100),
+        ({"subtype": "bus_lane", "location": "urban"}, 50),
+        ({"subtype": "highway", "location": "nonurban"}, 130),
+        ({"subtype": "play_street"}, 7),
+        ({"subtype": "road", "location": "urban", "region": "de-bw"}, 50),
+        ({"subtype": "road", "location": "urban", "region": "us-ca"}, None),
+        ({"subtype": "road"}, None),
+        ({"subtype": "walkway", "location": "urban"}, None),
+        ({"subtype": "road", "location": "urban", "speed_limit__vehicle": "60"}, 60),
+    ],
+)
+def test_german_limits_follow_from_the_kind_of_road(tmp_path, tags, limit):
+    graph = read_osm(tmp_path, tagged(lanelet(1), **tags))
+    given = graph.lane("l1").speed_limit
+    assert given == (None if limit is None else pytest.approx(limit / 3.6))
+    noted = limit is not None and "speed_limit__vehicle" not in tags
+    assert graph.notes == (
+        ("lanes with the speed limit of their kind of road in Germany: 1 (l1)",) if noted else ()
+    )
+
+
+@pytest.mark.parametrize(
+    ("towards", "allowed"), [("left", (True, False)), ("right", (False, True))]
+)
+def test_lane_changes_may_be_allowed_in_one_direction(tmp_path, towards, allowed):
+    other = {"left": "right", "right": "left"}[towards]
+    marks = f'<tag k="lane_change:{towards}" v="yes"/><tag k="lane_change:{other}" v="no"/></way>'
+    lane = read_osm(tmp_path, lanelet(1).replace("</way>", marks)).lane("l1")
+    assert (lane.may_change_left, lane.may_change_right) == allowed
+
+
+def mitred(centre, width, skew):
+    """Borders of a lane with kinks: parallels of its centre line, whose ends are not square."""
+    headings = np.unwrap(np.arctan2(*np.diff(centre, axis=0).T[::-1]))
+    turns = np.pad(np.diff(headings), 1)
+    mean = np.concatenate([headings[:1], (headings[:-1] + headings[1:]) / 2, headings[-1:]])
+    aside = np.column_stack([-np.sin(mean), np.cos(mean)]) / np.cos(turns / 2)[:, None]
+    rims = []
+    for side in (1, -1):
+        rim = centre + side * width / 2 * aside
+        along = np.column_stack([np.cos(headings), np.sin(headings)])
+        rim[0] -= side * skew[0] * along[0]
+        rim[-1] += side * skew[1] * along[-1]
+        rims.append(np.column_stack([rim, np.zeros(len(rim))]))
+    return rims
+
+
+def away(points, line):
+    """Distances of points from a line whose ends go on straight."""
+    ends = line[[0, -1]] + 100 * (line[[0, -1]] - line[[1, -2]])
+    line = np.concatenate([ends[:1], line, ends[1:]])[:, :2]
+    step = np.diff(line, axis=0)
+    rest = points[:, None, :2] - line[:-1]
+    squares = np.maximum((step * step).sum(axis=1), 1e-12)
+    share = np.clip((rest * step).sum(axis=2) / squares, 0, 1)
+    return np.linalg.norm(rest - share[..., None] * step, axis=2).min(axis=1)
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_the_borders_of_a_kinked_lane_follow_the_given_ones(seed):
+    rng = np.random.default_rng(seed)
+    headings = np.cumsum(np.radians([0, *rng.uniform(-50, 50, rng.integers(1, 6))]))
+    steps = rng.uniform(5, 25, (len(headings), 1))
+    along = np.column_stack([np.cos(headings), np.sin(headings)]) * steps
+    centre = np.concatenate([np.zeros((1, 2)), np.cumsum(along, axis=0)])
+    width = rng.uniform(2.5, 4.0)
+    given = mitred(centre, width, rng.uniform(-0.5, 0.5, 2))
+    points, widths = between(*given)
+    lane = Lane("a", "driving", points, widths)
+    assert away(points, np.pad(centre, ((0, 0), (0, 1)))).max() < 0.03
+    for rim, line in zip(lane.rims, given, strict=True):
+        assert away(rim, line).max() < 0.05
+        assert away(line, rim).max() < 0.05
+    np.testing.assert_allclose(points[[0, -1]], (given[0] + given[1])[[0, -1]] / 2, atol=1e-9)
+
+
+def test_the_borders_of_a_straight_lane_stay_even():
+    x = np.linspace(0.0, 10.0, 11)
+    left, right = (np.column_stack([x, np.full(11, y), x * 0]) for y in (3.0, 0.0))
+    points, widths = between(left, right)
+    np.testing.assert_array_equal(points, (left + right) / 2)
+    np.testing.assert_array_equal(widths, np.full(11, 3.0))
 
 
 @pytest.mark.parametrize("sign", ["de274-56", "usR2-1", "1.2.3"])
