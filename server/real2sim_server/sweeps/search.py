@@ -265,8 +265,10 @@ def _failure(
     if number < options.films:
         film = f"films/{name}.mp4"
         again = recording.replayer(evaluate.scene)
-        path = _made(out / "films") / f"{name}.mp4"
-        film_episode(recording, again, evaluate.scene, path, width=options.film_width)
+        path, poster = (_made(out / "films") / f"{name}{suffix}" for suffix in (".mp4", ".jpg"))
+        film_episode(
+            recording, again, evaluate.scene, path, width=options.film_width, poster=poster
+        )
     edges = boundaries(evaluate, found) if number < options.shrink else []
     replays = first_difference(recording, recording.replayer(evaluate.scene)) is None
     scene = _scene_path(evaluate.spaces[0].case.scene or "", options.scenes)
