@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import signal
 import subprocess
 import sys
@@ -11,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 from scipy.stats import norm
@@ -19,8 +21,11 @@ from typer.testing import CliRunner
 from real2sim.cli import build_app
 from real2sim.planners import Needs, load_planner
 from real2sim_server.console import CommandError
+from real2sim_server.policies.page import film_episode
 from real2sim_server.policies.suite import Case
 from real2sim_server.scene.io import load_scene
+from real2sim_server.scene.lane import Lane
+from real2sim_server.scene.lane_graph import LaneGraph
 from real2sim_server.sweeps.episode import Danger, Drive, adversaries_of, begin, drive_episode
 from real2sim_server.sweeps.evaluation import (
     SIDEWAYS,
@@ -30,7 +35,7 @@ from real2sim_server.sweeps.evaluation import (
     manoeuvres,
     plan_of,
 )
-from real2sim_server.sweeps.failure import boundaries
+from real2sim_server.sweeps.failure import Failure, boundaries, render_page
 from real2sim_server.sweeps.optimise import (
     Archive,
     GaussianProcess,
@@ -51,6 +56,7 @@ from real2sim_server.sweeps.search import (
 from real2sim_server.sweeps.spec import SHIPPED_SPACES, Space, load_space
 from real2sim_server.sweeps.sweep import Journal
 from real2sim_server.world.recording import first_difference, load_recording
+from real2sim_server.world.scoring.road import RoadMap
 
 BRAKES = Space.model_validate(
     {
@@ -355,6 +361,42 @@ def test_the_page_reports_what_was_found(found):
     assert page.count('class="card"') == report["cells"]
     assert page.count(">ego</text>") == page.count(">10 m</text>") == report["cells"]
     assert "Probability of a collision at fault" in page
+
+
+def test_the_page_draws_the_lanes_around_the_ego(found):
+    """A lane of 3.5 m along the ego, in the middle of a view of 44 m; one far away is left out."""
+    report = json.loads((found / FAILURES).read_text())
+    recording = load_recording(found / "recordings" / "failure_01.r2e")
+    ego = recording.instants[-1].ego
+    along = np.array([math.cos(ego.yaw), math.sin(ego.yaw), 0.0])
+    centre = np.array([ego.x, ego.y, 0.0]) + np.outer([-90.0, 90.0], along)
+    lanes = [
+        Lane(name, "driving", centre + np.array([0.0, aside, 0.0]), np.full(2, 3.5))
+        for name, aside in (("near", 0.0), ("far", 500.0))
+    ]
+    context = replace(recording.context, road_map=RoadMap(LaneGraph.of(lanes)))
+    shown = SimpleNamespace(cell=None, impact={}, values={})
+    mapped = replace(recording, context=context)
+    failure = Failure("failure_01", shown, mapped, True, None, [], "films/failure_01.mp4")
+    page = render_page(report, [failure])
+    assert 'poster="films/failure_01.jpg"' in page
+    [points] = re.findall(r'<polygon points="([^"]*)" [^>]*stroke=', page)
+    across = {float(point.split(",")[0]) for point in points.split()}
+    half = 1.75 * 300 / 44
+    assert sorted(across) == pytest.approx([150 - half, 150 + half], abs=0.1)
+
+
+def test_a_film_has_its_last_image_as_poster(found, scene, tmp_path):
+    recording = load_recording(found / "recordings" / "failure_01.r2e")
+    film, poster = tmp_path / "a.mp4", tmp_path / "a.jpg"
+    film_episode(recording, recording.replayer(scene), scene, film, width=64, poster=poster)
+    video, last = cv2.VideoCapture(str(film)), None
+    while (frame := video.read())[0]:
+        last = frame[1]
+    assert last is not None
+    # Films have an even number of rows.
+    shown = cv2.imread(str(poster))[: len(last)]
+    assert np.abs(shown.astype(float) - last).mean() < 12.0
 
 
 def test_boundaries_separate_failures_from_passes(evaluate):
