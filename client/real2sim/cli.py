@@ -24,7 +24,7 @@ PANELS = {
     "Logs and scenes": "log-info track reconstruct evaluate render scenes frame import export map "
     "ground fit-lidar fit-uncertainty",
     "Edit and physics": "edit scenario simulate film calibrate validate",
-    "Drive": "drive run replay evaluate-policy sweep search adapter ros2",
+    "Drive": "drive run gallery replay evaluate-policy sweep search adapter ros2",
     "Data": "export-dataset train-policy",
     "Operate": "serve status token store backup restore bench",
 }

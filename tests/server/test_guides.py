@@ -200,6 +200,7 @@ def test_scenarios(page: Callable[[str], Page], demo: real2sim.Client) -> None:
         ours = names["scenario"].scenario_id
         scenarios.shell("scenario gallery", {"sc_1f2e": ours})
         assert b"OpenSCENARIO" in (scenarios.folder / "again.xosc").read_bytes()
+        scenarios.shell("real2sim gallery", {"gap=8": "gap=8 --seconds 2"})
         names["client"].close()
 
 

@@ -1,4 +1,4 @@
-"""Commands that drive without a worker: run, replay, sweep and search."""
+"""Commands that drive without a worker, and the gallery: run, gallery, replay, sweep, search."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.table import Table
 
 from ..console import (
     CommandError,
@@ -24,12 +25,16 @@ from .common import Follow, JsonFile, command
 if TYPE_CHECKING:
     from real2sim_proto.storyboard import Storyboard
 
+    from ..scenarios.gallery import CornerCase
     from ..scenarios.openscenario import ReadOptions
     from ..scene import Scene
     from ..sweeps.episode import Driven
     from ..world.agents import Event
     from ..world.recording import Recording
     from ..world.replay import Replayer
+
+
+ScenesFolder = Annotated[Path | None, typer.Option("--scenes", help="Folder of scene bundles.")]
 
 
 # --- run ------------------------------------------------------------------------------------------
@@ -45,11 +50,12 @@ def run(
         str, typer.Argument(help="OpenSCENARIO file (.xosc), storyboard (.json) or gallery:NAME.")
     ],
     scene: Annotated[
-        Path | None,
+        str | None,
         typer.Argument(
             help="Scene bundle, or demo_street; default: a flat scene made from the file's roads."
         ),
     ] = None,
+    scenes: ScenesFolder = None,
     planner: Annotated[
         str, typer.Option(help="Planner as for evaluate-policy; 'storyboard' scripts the ego too.")
     ] = SCRIPTED,
@@ -98,6 +104,7 @@ def run(
     from ..scenarios.flat_scene import fitted_to_scene
     from ..scenarios.openscenario import ReadOptions
     from ..sweeps.episode import recording_of
+    from ..sweeps.spec import open_scene
     from ..world.recording import save_recording
 
     options = ReadOptions(_parameters(values or []), frozenset(leave_out or ()), ego, strict)
@@ -117,7 +124,10 @@ def run(
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="real2sim-")))
         report = stack.enter_context(staged_progress())
         report("scene", 0, 1)
-        loaded = _scene(scene, board, road_file, scene_out or folder / "scene")
+        if scene is not None:
+            loaded = open_scene(scene, scenes)
+        else:
+            loaded = _flat_scene(board, road_file, scene_out or folder / "scene")
         if scene is not None and any(e.kind == "ego" and e.box for e in board.entities):
             console.print("note: the ego is the scene's vehicle, and not the file's")
         if not as_it_is and (scene is not None or road_file is None):
@@ -217,17 +227,14 @@ def _with_speed(board: Storyboard, speed: float) -> Storyboard:
     return Storyboard.model_validate(fields)
 
 
-def _scene(bundle: Path | None, board: Storyboard, road_file: Path | None, made: Path) -> Scene:
-    """The scene to drive in; a flat scene is first written to ``made`` to give it a hash."""
+def _flat_scene(board: Storyboard, road_file: Path | None, made: Path) -> Scene:
+    """A flat scene of the storyboard's roads, written to ``made`` to give it a hash."""
     from ..maps import MapError
     from ..scenarios import ScenarioError
     from ..scenarios.flat_scene import flat_scene, positions_off_roads
     from ..scene.io import load_scene, save_scene
-    from ..sweeps.spec import open_scene
     from ..world import WorldError
 
-    if bundle is not None:
-        return open_scene(str(bundle))
     try:
         flat = flat_scene(board, road_file)
     except (ScenarioError, MapError, WorldError) as error:
@@ -317,6 +324,64 @@ def _print(file: str, figures: dict[str, Any]) -> None:
     print_figures(f"{Path(file).name}: {figures['seconds']:.1f} s, {figures['reason']}", rows)
 
 
+# --- gallery --------------------------------------------------------------------------------------
+
+
+@command("gallery")
+def gallery(
+    *,
+    name: Annotated[
+        str | None, typer.Argument(help="Case to print as a storyboard; default: list all cases.")
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", help="Write the case to this OpenSCENARIO file (.xosc) instead."),
+    ] = None,
+    json: JsonFile = None,
+) -> None:
+    """List the corner cases that `run gallery:NAME` drives, or print one of them.
+
+    A printed case is a storyboard in JSON, which `run` drives from a file.
+    """
+    from ..scenarios.gallery import FAMILIES, GALLERY, corner_case
+
+    if name is None:
+        if out is not None:
+            raise CommandError(f"--out writes a single case; name one of {', '.join(GALLERY)}")
+        for family, tests in FAMILIES.items():
+            columns = ("name", "what happens", "parameters")
+            table = Table(*columns, title=f"{family}: {tests}", title_justify="left")
+            for case in (c for c in GALLERY.values() if c.family == family):
+                values = ", ".join(f"{p} {value:g}" for p, value in case.parameters.items())
+                table.add_row(case.name, case.title, values)
+            console.print(table)
+        write_json(json, {"cases": [_case_fields(case) for case in GALLERY.values()]})
+        return
+    try:
+        case = corner_case(name)
+    except ValueError as error:
+        raise CommandError(str(error)) from error
+    board = case.storyboard()
+    if out is not None:
+        _export(board, out)
+    else:
+        typer.echo(board.model_dump_json(indent=2, exclude_unset=True))
+    fields = board.model_dump(mode="json", exclude_unset=True)
+    write_json(json, {**_case_fields(case), "storyboard": fields})
+
+
+def _case_fields(case: CornerCase) -> dict[str, Any]:
+    from ..scenarios.gallery import FAMILIES
+
+    return {
+        "name": case.name,
+        "title": case.title,
+        "family": case.family,
+        "tests": FAMILIES[case.family],
+        "parameters": dict(case.parameters),
+    }
+
+
 # --- replay ---------------------------------------------------------------------------------------
 
 
@@ -325,8 +390,10 @@ def replay(
     *,
     episode: Annotated[Path, typer.Argument(help="Recording of an episode (.r2e).")],
     scene: Annotated[
-        Path | None, typer.Option("--scene", help="Scene bundle; simulates the episode again.")
+        str | None,
+        typer.Option("--scene", help="Scene bundle, or demo_street; simulates the episode again."),
     ] = None,
+    scenes: ScenesFolder = None,
     assets: Annotated[
         Path | None, typer.Option("--assets", help="Asset library of the scenario.")
     ] = None,
@@ -350,7 +417,7 @@ def replay(
         "scores": [score.fields() for score in recording.rescore()],
     }
     if scene is not None:
-        loaded = _load_its_scene(recording, scene)
+        loaded = _load_its_scene(recording, scene, scenes)
         start = _replay_factory(recording, loaded, assets)
         difference = first_difference(recording, start())
         figures["bit_identical"] = difference is None
@@ -359,7 +426,7 @@ def replay(
             film_episode(recording, start(), loaded, video, camera=camera, width=width)
             console.print(f"wrote {video}")
     elif video is not None:
-        raise CommandError("--video draws the scene; name its bundle with --scene")
+        raise CommandError("--video draws the scene; name it with --scene")
     if mcap is not None:
         save_mcap(recording, mcap)
         console.print(f"wrote {mcap}")
@@ -372,13 +439,13 @@ def replay(
         )
 
 
-def _load_its_scene(recording: Recording, path: Path) -> Scene:
-    from ..scene.io import load_scene
+def _load_its_scene(recording: Recording, name: str, folder: Path | None) -> Scene:
+    from ..sweeps.spec import open_scene
 
-    scene = load_scene(path)
+    scene = open_scene(name, folder)
     if scene.content_hash != recording.scene_hash:
         raise CommandError(
-            f"the episode ran on a scene with hash {recording.scene_hash[:12]}; {path} has "
+            f"the episode ran on a scene with hash {recording.scene_hash[:12]}; {name} has "
             f"{(scene.content_hash or '')[:12]}"
         )
     return scene
@@ -430,9 +497,7 @@ def sweep(
     *,
     spec: Annotated[Path, typer.Argument(help="sweep.yaml or .json, see docs/sweeps.md.")],
     out: Annotated[Path, typer.Option("--out", help="Output folder; an existing sweep resumes.")],
-    scenes: Annotated[
-        Path | None, typer.Option("--scenes", help="Folder of scene bundles.")
-    ] = None,
+    scenes: ScenesFolder = None,
     workers: Annotated[
         int, typer.Option(min=1, max=4096, help="Episodes to drive in parallel.")
     ] = 1,
@@ -476,7 +541,7 @@ def search(
         typer.Argument(help="Files as for `sweep`, or shipped: cut_in, hard_brake, oncoming, ..."),
     ],
     planner: Annotated[str, typer.Option(help="Planner as for `drive`, see docs/policies.md.")],
-    out: Annotated[Path, typer.Option("--out", help="Output folder for failures and the report.")],
+    out: Annotated[Path, typer.Option("--out", help="Output folder; an existing search resumes.")],
     episodes: Annotated[int, typer.Option(min=20, max=100_000, help="Number of episodes.")] = 300,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the search.")] = 0,
     shrink: Annotated[
@@ -486,15 +551,14 @@ def search(
         int, typer.Option(min=0, help="Episodes to estimate the failure rate; 0: none.")
     ] = 0,
     films: Annotated[int, typer.Option(min=0, help="Number of failures to film.")] = 0,
-    scenes: Annotated[
-        Path | None, typer.Option("--scenes", help="Folder of scene bundles.")
-    ] = None,
+    scenes: ScenesFolder = None,
     json: JsonFile = None,
     follow: Follow = False,
 ) -> None:
     """Find avoidable collisions that are the planner's fault.
 
     Writes failures.json, each failure as a case and as a recording, and a page; see docs/sweeps.md.
+    If it is interrupted, run the same command again to continue; it ends with the same result.
     """
     from ..console import write_json
     from ..sweeps import load_space
@@ -514,6 +578,6 @@ def search(
     write_json(json, found)
     if follow:
         return
-    keys = ("episodes", "first_failure", "at_fault", "avoidable", "cells")
+    keys = ("episodes", "driven_now", "first_failure", "at_fault", "avoidable", "cells")
     print_figures(f"failures of {planner}", {k: found[k] for k in keys})
     console.print(f"wrote {out / 'failures.html'} and {out / 'failures.json'}")

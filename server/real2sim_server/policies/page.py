@@ -18,9 +18,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from .._files import atomic_file
 from ..geometry import quaternion_yaw
 from ..render import RasterOptions, render_cameras, select_backend
-from ..render.images import video_file
+from ..render.images import turbo_jpeg, video_file
 from ..scene import Scene
 from ..world import World
 from ..world.recording import Recording, load_recording
@@ -181,6 +182,7 @@ Image = NDArray[np.uint8]
 MAP_PIXELS, MAP_METRES = 160, 60.0
 BACKGROUND, ROUTE, OBJECT, EGO = (40, 40, 40), (160, 160, 160), (255, 140, 60), (120, 220, 120)
 """Colors of the map."""
+POSTER_QUALITY = 85
 
 
 def film_episode(
@@ -191,6 +193,7 @@ def film_episode(
     *,
     camera: str | None = None,
     width: int = 640,
+    poster: Path | None = None,
 ) -> None:
     """Write an MP4 of a replayed episode, one image per step.
 
@@ -201,6 +204,7 @@ def film_episode(
         path: file to write.
         camera: camera name; None: the first one.
         width: width of the film [px].
+        poster: JPEG file to write, with the last image; None writes none.
     """
     chosen = scene.rig[camera or scene.rig.names[0]].resized(width)
     backend = select_backend("auto")
@@ -222,6 +226,9 @@ def film_episode(
                 rate = 1e6 / world.spec.dt_us
                 video = stack.enter_context(video_file(path, frames_per_second=rate))
             video.add(image)
+    if poster is not None:
+        with atomic_file(poster) as file:
+            file.write(turbo_jpeg(image, POSTER_QUALITY))
 
 
 def _instants(recording: Recording, replayer: Replayer) -> Iterator[World]:

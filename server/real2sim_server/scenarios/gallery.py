@@ -25,7 +25,7 @@ class CornerCase:
     Attributes:
         name: unique name.
         title: description in one sentence.
-        family: kind of case, such as ``crossing``.
+        family: one of ``FAMILIES``.
         parameters: their defaults; lengths in m, speeds in m/s, times in s.
         make: builds the storyboard's fields.
     """
@@ -56,6 +56,14 @@ class CornerCase:
 
 GALLERY: dict[str, CornerCase] = {}
 """Cases by name."""
+
+FAMILIES = {
+    "ahead": "keeping a distance and braking for what is ahead",
+    "lanes": "lane changes of others, and keeping the lane",
+    "oncoming": "traffic that comes towards the ego",
+    "crossing": "road users that cross the ego's path",
+}
+"""What the cases of each family test."""
 
 
 def corner_case(name: str) -> CornerCase:

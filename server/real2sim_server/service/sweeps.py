@@ -27,10 +27,11 @@ from .sessions.recording import RECORDING
 # --- Files ---------------------------------------------------------------------------------------
 
 SPEC, OUT, FIGURES = "sweep.json", "out", "figures.json"
-TABLE, FAILURES, PAGE, ARCHIVE = (
+TABLE, FAILURES, PAGE, JOURNAL, ARCHIVE = (
     "episodes.parquet",
     "failures.json",
     "failures.html",
+    "search.journal",
     "failures.tar",
 )
 PARQUET, XML, JSON, TAR = (
@@ -131,10 +132,11 @@ def left_by_search(context: JobContext, scene: str) -> JobResult:
         *sorted(out.glob("recordings/*")),
     ]:
         files |= _copied(path, folder)
+    (out / JOURNAL).unlink()
     pack(out, folder / ARCHIVE, context)
     files[ARCHIVE] = TAR
     _tidy(folder)
-    keys = ("episodes", "first_failure", "at_fault", "avoidable", "cells", "spaces")
+    keys = ("episodes", "driven_now", "first_failure", "at_fault", "avoidable", "cells", "spaces")
     failures = [{name: f.get(name) for name in SUMMED_UP} for f in found["failures"]]
     return JobResult({k: found[k] for k in keys} | {"failures": failures}, files)
 

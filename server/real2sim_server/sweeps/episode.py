@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -335,9 +336,14 @@ class Drive:
         scores.
         """
         name, _, argument = self.planner.partition("=")
+        module, of_module, _ = name.partition(":")
         content = {
             "scene": scene_hash,
-            "planner": [name, _file_hash(argument) if argument else ""],
+            "planner": [
+                name,
+                _file_hash(argument) if argument else "",
+                *([_source_hash(module)] if of_module else []),
+            ],
             "reset": dict(self.reset),
             "operations": [dict(o) for o in self.operations],
             "versions": [version("real2sim"), metrics_version()],
@@ -470,3 +476,9 @@ def _checked(plan: Any) -> TrajectoryPlan | Control | PoseCommand:
 def _file_hash(argument: str) -> str:
     path = Path(argument)
     return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else argument
+
+
+def _source_hash(module: str) -> str:
+    """Hash of the source file of a planner's module; empty if the module is not loaded from one."""
+    source = getattr(sys.modules.get(module), "__file__", None)
+    return _file_hash(source) if source else ""

@@ -18,6 +18,7 @@ from ..world import World
 from .episode import OPERATIONS, Drive, Driven, adversaries_of, begin, drive_episode, signed_gaps
 from .parameters import Value, drawn_parameters, values_at
 from .spec import Space
+from .sweep import Journal
 
 # --- Reference driver ----------------------------------------------------------------------------
 
@@ -396,32 +397,49 @@ class Evaluator:
         spaces: spaces to search.
         planner: name of the tested planner.
         seed: seed of the episodes.
+        journal: open journal with the outcomes of episodes; None keeps none.
     """
 
     def __init__(
-        self, scene: Scene, spaces: Sequence[Space], planner: str, *, seed: int = 0
+        self,
+        scene: Scene,
+        spaces: Sequence[Space],
+        planner: str,
+        *,
+        seed: int = 0,
+        journal: Journal | None = None,
     ) -> None:
         self.scene, self.spaces, self.planner, self.seed = scene, list(spaces), planner, seed
         self.statistics = DrivingStatistics.of(scene)
-        self.done = 0
+        self.journal = journal
 
     def dimensions(self, space: int) -> int:
         """Number of coordinates of a point of a space."""
         return len(drawn_parameters(self.spaces[space].parameters))
 
     def __call__(self, space: int, point: Sequence[float] | NDArray[np.float64]) -> Evaluation:
-        """Drive a point; increments the number of evaluations."""
-        self.done += 1
+        """Drive a point, unless its episode is in the journal."""
         asked = self.spaces[space]
         inside = tuple(float(min(max(u, 0.0), 1.0)) for u in point)
         values = values_at(asked.parameters, inside)
-        case = asked.case_at(values)
-        drive = Drive.of(case, self.planner, self.seed)
+        drive = Drive.of(asked.case_at(values), self.planner, self.seed)
+        return Evaluation(space, inside, values, drive, **self._outcome(drive))
+
+    def _outcome(self, drive: Drive) -> dict[str, Any]:
+        """Fields of an evaluation that depend only on the episode."""
+        if self.journal is None:
+            return self._driven(drive)
+        key = drive.key(self.scene.content_hash or "")
+        if key not in self.journal.rows:
+            self.journal.add(key, self._driven(drive))
+        row = self.journal.rows[key]
+        return row | {"cell": row["cell"] and tuple(row["cell"])}
+
+    def _driven(self, drive: Drive) -> dict[str, Any]:
         watch = Watch(adversaries_of(drive.reset), self.statistics)
         driven = drive_episode(self.scene, drive, load_planner(self.planner), on_world=watch.add)
-        given: dict[str, Any] = {"space": space, "point": inside, "values": values, "drive": drive}
         if driven.world is None or driven.error is not None:
-            return Evaluation(**given, **_nothing())
+            return _nothing()
         strange = watch.implausibility()
         score, avoided = driven.criticality - strange, None
         if driven.at_fault:
@@ -433,16 +451,15 @@ class Evaluator:
                 score = -strange
             else:
                 score = max(score, 0.01)
-        return Evaluation(
-            **given,
-            score=score,
-            criticality=driven.criticality,
-            implausibility=strange,
-            at_fault=driven.at_fault,
-            avoided=avoided,
-            cell=cell_of(driven) if driven.at_fault else None,
-            impact=impact_of(driven) if driven.at_fault else {},
-        )
+        return {
+            "score": score,
+            "criticality": driven.criticality,
+            "implausibility": strange,
+            "at_fault": driven.at_fault,
+            "avoided": avoided,
+            "cell": cell_of(driven) if driven.at_fault else None,
+            "impact": impact_of(driven) if driven.at_fault else {},
+        }
 
     def reference(self, drive: Drive) -> Drove:
         """Drive the same episode with the reference driver."""

@@ -6,19 +6,22 @@ import dataclasses
 import json
 import math
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from real2sim.planners import load_planner
 from real2sim_proto.episode import ResetSpec
 
 from ..policies.page import STYLE
+from ..scene.lane import DRIVABLE
 from ..world.recording import Recording
+from ..world.scoring.instant import ScoringContext
 from .episode import Drive, Driven, drive_episode
 from .evaluation import Evaluation, Evaluator, impact_of
 from .parameters import Value, drawn_parameters, values_at
@@ -240,14 +243,28 @@ class Failure:
 # --- Page -----------------------------------------------------------------------------------------
 
 MAP_M, MAP_PX = 44.0, 300
+SCALE_M = 10
+"""Length of the scale bar [m]."""
+EGO, HIT, OTHER, ROAD, LINE = "#2b8a3e", "#d9622b", "#8f99a4", "#dde2e7", "#ffffff"
 CARDS = """
 .cards{display:grid;grid-template-columns:repeat(auto-fill,minmax(300px,1fr));gap:1.2rem}
-.card{border:1px solid #dfe3e8;border-radius:6px;padding:.7rem .8rem}
+.card{border:1px solid #dfe3e8;border-radius:6px;padding:.7rem .8rem;min-width:0}
 .card h3{margin:.1rem 0 .4rem}.card p{margin:.25rem 0;font-size:.86rem}
 svg{background:#f4f6f8;border-radius:4px;width:100%;height:auto;display:block}
+svg text{font-size:11px;font-weight:600;paint-order:stroke;stroke:#fff;stroke-width:3px}
+.key{font-size:.86rem}.key span{margin-right:.8rem;white-space:nowrap}
+.key i{display:inline-block;width:.8rem;height:.8rem;border-radius:2px;vertical-align:-.08rem}
 .big{font-size:1.05rem;color:#1a1d21}.bar{background:#3b6fb6;height:.7rem;display:inline-block}
-video{width:100%;border-radius:4px;margin-top:.4rem}
+video{width:100%;border-radius:4px;margin-top:.4rem;display:block}code{overflow-wrap:anywhere}
 """
+
+
+COLOURS = {"ego": EGO, "what it collides with": HIT, "others": OTHER, "road": ROAD}
+KEY = (
+    '<p class="key">'
+    + " ".join(f'<span><i style="background:{c}"></i> {name}</span>' for name, c in COLOURS.items())
+    + "<br>From above at the end of the episode; pale: every half second of the 3 s before.</p>"
+)
 
 
 def render_page(report: Mapping[str, Any], failures: Sequence[Failure]) -> str:
@@ -258,14 +275,16 @@ def render_page(report: Mapping[str, Any], failures: Sequence[Failure]) -> str:
         [
             f"<h1>{escape(title)}</h1>",
             _summary(report),
-            f'<div class="cards">{cards}</div>' if failures else "",
+            f'{KEY}<div class="cards">{cards}</div>' if failures else "",
             "<h2>What decides</h2>",
             *(_space(s) for s in report["spaces"]),
         ]
     )
     return (
-        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{escape(title)}'
-        f"</title><style>{STYLE}{CARDS}</style></head><body>\n{body}\n</body></html>\n"
+        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width">'
+        f"<title>{escape(title)}</title><style>{STYLE}{CARDS}</style></head>"
+        f"<body>\n{body}\n</body></html>\n"
     )
 
 
@@ -301,7 +320,11 @@ def _card(failure: Failure) -> str:
             f"instead of {_number(edge.failing)}.</p>"
         )
     if failure.film:
-        lines.append(f'<video controls preload="none" src="{escape(failure.film)}"></video>')
+        poster = Path(failure.film).with_suffix(".jpg").as_posix()
+        lines.append(
+            f'<video controls playsinline preload="none" poster="{escape(poster)}" '
+            f'src="{escape(failure.film)}"></video>'
+        )
     same = "same bits again" if failure.replays else "comes out differently"
     lines.append(
         f'<p><a href="recordings/{failure.name}.r2e">recording</a> ({same}), '
@@ -336,23 +359,25 @@ def _top_view(failure: Failure) -> str:
     cos, sin = math.cos(last.ego.yaw), math.sin(last.ego.yaw)
     scale = MAP_PX / MAP_M
 
-    def placed(x: float, y: float) -> tuple[float, float]:
-        dx, dy = x - last.ego.x, y - last.ego.y
-        ahead, left = cos * dx + sin * dy, cos * dy - sin * dx
-        return MAP_PX / 2 - left * scale, MAP_PX * 0.62 - ahead * scale
+    def placed(points: NDArray[np.float64]) -> str:
+        """Points [N, 2 or more] of the world, as the attribute ``points``."""
+        dx, dy = points[:, 0] - last.ego.x, points[:, 1] - last.ego.y
+        x = MAP_PX / 2 - (cos * dy - sin * dx) * scale
+        y = MAP_PX * 0.62 - (cos * dx + sin * dy) * scale
+        return " ".join(f"{px:.1f},{py:.1f}" for px, py in zip(x, y, strict=True))
 
     def box(x: float, y: float, yaw: float, size: Sequence[float], style: str) -> str:
-        c, s = math.cos(yaw), math.sin(yaw)
+        """A box with a pointed front."""
         length, width = size[0] / 2, size[1] / 2
-        corners = [
-            placed(x + u * length * c - v * width * s, y + u * length * s + v * width * c)
-            for u, v in ((1, 1), (1, -1), (-1, -1), (-1, 1))
-        ]
-        points = " ".join(f"{px:.1f},{py:.1f}" for px, py in corners)
-        return f'<polygon points="{points}" {style}/>'
+        nose = length - min(0.9, length)
+        local = np.array(
+            [(length, 0.0), (nose, width), (-length, width), (-length, -width), (nose, -width)]
+        )
+        c, s = math.cos(yaw), math.sin(yaw)
+        return f'<polygon points="{placed(local @ [[c, s], [-s, c]] + [x, y])}" {style}/>'
 
     hit = failure.found.impact.get("object")
-    parts = []
+    parts = _road(context, placed, np.array([last.ego.x, last.ego.y]), scale)
     shown = instants[-31::5] if len(instants) > 1 else instants
     for instant in [*shown, last]:
         faint = "" if instant is last else ' opacity="0.25"'
@@ -362,15 +387,56 @@ def _top_view(failure: Failure) -> str:
         for k, name in enumerate(others.ids):
             if name != hit and instant is not last:
                 continue
-            colour = "#d9622b" if name == hit else "#9aa3ad"
-            style = f'fill="{colour}"{faint}'
+            style = f'fill="{HIT if name == hit else OTHER}"{faint}'
             cx, cy = others.centres[k, :2].tolist()
             parts.append(box(cx, cy, float(others.yaws[k]), others.sizes[k].tolist(), style))
-        parts.append(box(x, y, ego.yaw, context.ego_size, f'fill="#3a9a4a"{faint}'))
+        parts.append(box(x, y, ego.yaw, context.ego_size, f'fill="{EGO}"{faint}'))
+    beside = MAP_PX / 2 + (context.ego_size[1] / 2 + 0.6) * scale
+    behind = MAP_PX * 0.62 - context.centre_ahead * scale + 4
+    parts.append(f'<text x="{beside:.1f}" y="{behind:.1f}" fill="{EGO}">ego</text>')
+    left, bottom = 10, MAP_PX - 10
+    parts.append(
+        f'<path d="M{left} {bottom - 5}v5h{SCALE_M * scale:.1f}v-5" fill="none" stroke="#1a1d21"/>'
+        f'<text x="{left + 5}" y="{bottom - 4}" fill="#1a1d21">{SCALE_M} m</text>'
+    )
     return (
         f'<svg viewBox="0 0 {MAP_PX} {MAP_PX}" role="img" aria-label="from above">'
         f"{''.join(parts)}</svg>"
     )
+
+
+def _road(
+    context: ScoringContext,
+    placed: Callable[[NDArray[np.float64]], str],
+    middle: NDArray[np.float64],
+    scale: float,
+) -> list[str]:
+    """Lanes within the top view: of the map, or else the corridors of the recorded drives."""
+
+    def near(line: NDArray[np.float64]) -> bool:
+        gaps = line[:, :2] - middle
+        # The ends of a long straight lane may both be far away.
+        return bool((gaps.min(axis=0) < MAP_M).all() and (gaps.max(axis=0) > -MAP_M).all())
+
+    if context.road_map is None:
+        driven = [(context.route, context.corridor), *((k, context.lane) for k in context.lanes)]
+        driven = [(line, half) for line, half in driven if near(line)]
+        shapes = [(line, ROAD, f"{2 * half * scale:.1f}") for line, half in driven]
+        shapes += [(line, LINE, '1" stroke-dasharray="6 6') for line, _ in driven]
+        return [
+            f'<polyline points="{placed(line)}" fill="none" stroke="{colour}" '
+            f'stroke-width="{width}" stroke-linejoin="round"/>'
+            for line, colour, width in shapes
+        ]
+    lanes = context.road_map.graph.lanes.values()
+    outlines = [
+        np.concatenate([a, b[::-1]]) for a, b in (k.rims for k in lanes if k.kind in DRIVABLE)
+    ]
+    return [
+        f'<polygon points="{placed(line)}" fill="{ROAD}" stroke="{LINE}" stroke-width="1.5"/>'
+        for line in outlines
+        if near(line)
+    ]
 
 
 def _space(space: Mapping[str, Any]) -> str:
@@ -382,7 +448,11 @@ def _space(space: Mapping[str, Any]) -> str:
         for name, index in sorted(space["sobol"].items(), key=lambda kv: -kv[1]["total"])
     )
     head = "<tr><th>parameter</th><th>alone</th><th>with others</th><th></th></tr>"
-    table = f"<table>{head}{rows}</table>" if rows else "<p>Too few episodes for indices.</p>"
+    table = (
+        f'<div class="scroll"><table>{head}{rows}</table></div>'
+        if rows
+        else "<p>Too few episodes for indices.</p>"
+    )
     odds = space["probability"]
     chance = ""
     if odds is not None:

@@ -26,6 +26,7 @@ from .failure import Failure, boundaries, render_page, write_scenario
 from .optimise import SearchBudget, SearchState, search
 from .parameters import drawn_parameters
 from .spec import Space, open_scene
+from .sweep import Journal
 
 # --- Statistics ----------------------------------------------------------------------------------
 
@@ -165,7 +166,7 @@ def sobol_indices(
     return {n: (float(f), float(t)) for n, (f, t) in zip(names, both, strict=True)}
 
 
-FAILURES, PAGE = "failures.json", "failures.html"
+FAILURES, PAGE, JOURNAL = "failures.json", "failures.html", "search.journal"
 TAKE_OVERS = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0)
 """Take-over times of the reference before an impact [s]."""
 Report = Callable[[str, int, int], None]
@@ -202,8 +203,11 @@ def run_search(
 ) -> dict[str, Any]:
     """Search spaces of one scene for a planner's avoidable failures, and write the findings.
 
+    Episodes that are already in the journal of the folder are not driven again; what is found
+    depends neither on them nor on interruptions of the search.
+
     Returns:
-        Contents of ``failures.json``.
+        Contents of ``failures.json``, and ``driven_now``, the number of newly driven episodes.
 
     Raises:
         CommandError: spaces of several scenes, an unsuitable planner, or no such scene.
@@ -211,20 +215,28 @@ def run_search(
     options = options or SearchOptions()
     scene = _scene_of(spaces, options.scenes)
     _check_planner(planner, scene)
-    evaluate = Evaluator(scene, spaces, planner)
-    state = search(evaluate, options.budget, on_progress=lambda d, t: on_progress("search", d, t))
-    found = state.archive.ordered()
-    failures = []
-    for k, one in enumerate(found):
-        failures.append(_failure(evaluate, one, k, out, options))
-        on_progress("failures", k + 1, len(found))
-    odds = _probabilities(evaluate, options, on_progress)
+    try:
+        journal = Journal(out / JOURNAL)
+    except ValueError as error:
+        raise CommandError(str(error)) from error
+    known = len(journal.rows)
+    with journal:
+        evaluate = Evaluator(scene, spaces, planner, journal=journal)
+        state = search(
+            evaluate, options.budget, on_progress=lambda d, t: on_progress("search", d, t)
+        )
+        found = state.archive.ordered()
+        failures = []
+        for k, one in enumerate(found):
+            failures.append(_failure(evaluate, one, k, out, options))
+            on_progress("failures", k + 1, len(found))
+        odds = _probabilities(evaluate, options, on_progress)
     report = _report(evaluate, state, failures, odds, options)
     with atomic_file(out / FAILURES) as file:
         file.write(json.dumps(report, indent=2, allow_nan=False).encode())
     with atomic_file(out / PAGE) as file:
         file.write(render_page(report, failures).encode())
-    return report
+    return {**report, "driven_now": len(journal.rows) - known}
 
 
 def _scene_of(spaces: Sequence[Space], folder: Path | None) -> Scene:
@@ -265,8 +277,10 @@ def _failure(
     if number < options.films:
         film = f"films/{name}.mp4"
         again = recording.replayer(evaluate.scene)
-        path = _made(out / "films") / f"{name}.mp4"
-        film_episode(recording, again, evaluate.scene, path, width=options.film_width)
+        path, poster = (_made(out / "films") / f"{name}{suffix}" for suffix in (".mp4", ".jpg"))
+        film_episode(
+            recording, again, evaluate.scene, path, width=options.film_width, poster=poster
+        )
     edges = boundaries(evaluate, found) if number < options.shrink else []
     replays = first_difference(recording, recording.replayer(evaluate.scene)) is None
     scene = _scene_path(evaluate.spaces[0].case.scene or "", options.scenes)

@@ -43,6 +43,7 @@ COMMANDS = {
     "sweep": "{spec} --out {out} --scenes {scenes}",
     "train-policy": "{flat} --out {out}.safetensors --epochs 1 --shifted 0",
     "replay": "{episode} --scene {flat}",
+    "gallery": "",
     "doctor": "",
 }
 SPEC = """

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import math
 
 import pytest
+from typer.testing import CliRunner
 
+from real2sim.cli import build_app
 from real2sim_proto.episode import ResetSpec
 from real2sim_proto.storyboard import Storyboard
 from real2sim_server.edit import ScenarioState
@@ -128,3 +131,43 @@ def test_unknown_cases_and_parameters_are_refused_by_name():
         corner_case("gallery:cut_on")
     with pytest.raises(ValueError, match="no parameter 'gab'"):
         corner_case("cut_in").storyboard(gab=3.0)
+
+
+# --- real2sim gallery -----------------------------------------------------------------------------
+
+
+def gallery(*arguments: str) -> str:
+    done = CliRunner().invoke(build_app(), ["gallery", *arguments], env={"COLUMNS": "200"})
+    assert done.exit_code == 0, done.output
+    return done.output
+
+
+def test_the_command_lists_every_case_with_what_it_tests_and_its_parameters(tmp_path):
+    output = gallery("--json", str(tmp_path / "cases.json"))
+    listed = json.loads((tmp_path / "cases.json").read_text())["cases"]
+    assert [case["name"] for case in listed] == list(GALLERY)
+    for case in listed:
+        assert all(case[key] in output for key in ("name", "title", "tests"))
+        assert case["parameters"] == GALLERY[case["name"]].parameters
+    assert "gap 12, speed 7, duration 2" in output
+
+
+@pytest.mark.parametrize("name", GALLERY)
+def test_a_printed_case_is_the_storyboard_itself(name):
+    assert Storyboard.model_validate_json(gallery(name)) == corner_case(name).storyboard()
+
+
+def test_the_command_writes_a_case_as_openscenario(tmp_path):
+    gallery("cut_in", "--out", str(tmp_path / "cut_in.xosc"))
+    written = (tmp_path / "cut_in.xosc").read_bytes()
+    assert written == write_openscenario(corner_case("cut_in").storyboard())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [(["cut_off"], "has no 'cut_off'; it has: ccrs"), (["--out", "a.xosc"], "name one of ccrs")],
+)
+def test_the_command_names_the_cases_it_has(arguments, message):
+    done = CliRunner().invoke(build_app(), ["gallery", *arguments])
+    assert done.exit_code == 1
+    assert message in done.output

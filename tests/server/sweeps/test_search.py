@@ -4,16 +4,28 @@ from __future__ import annotations
 
 import json
 import math
+import re
+import signal
+import subprocess
+import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 from scipy.stats import norm
+from typer.testing import CliRunner
 
+from real2sim.cli import build_app
 from real2sim.planners import Needs, load_planner
+from real2sim_server.console import CommandError
+from real2sim_server.policies.page import film_episode
 from real2sim_server.policies.suite import Case
 from real2sim_server.scene.io import load_scene
+from real2sim_server.scene.lane import Lane
+from real2sim_server.scene.lane_graph import LaneGraph
 from real2sim_server.sweeps.episode import Danger, Drive, adversaries_of, begin, drive_episode
 from real2sim_server.sweeps.evaluation import (
     SIDEWAYS,
@@ -23,7 +35,7 @@ from real2sim_server.sweeps.evaluation import (
     manoeuvres,
     plan_of,
 )
-from real2sim_server.sweeps.failure import boundaries
+from real2sim_server.sweeps.failure import Failure, boundaries, render_page
 from real2sim_server.sweeps.optimise import (
     Archive,
     GaussianProcess,
@@ -33,6 +45,7 @@ from real2sim_server.sweeps.optimise import (
 )
 from real2sim_server.sweeps.search import (
     FAILURES,
+    JOURNAL,
     PAGE,
     SearchOptions,
     run_search,
@@ -41,7 +54,9 @@ from real2sim_server.sweeps.search import (
     wilson,
 )
 from real2sim_server.sweeps.spec import SHIPPED_SPACES, Space, load_space
+from real2sim_server.sweeps.sweep import Journal
 from real2sim_server.world.recording import first_difference, load_recording
+from real2sim_server.world.scoring.road import RoadMap
 
 BRAKES = Space.model_validate(
     {
@@ -82,9 +97,18 @@ def evaluate(scene) -> Evaluator:
 def found(scene_folder, tmp_path_factory) -> Path:
     pytest.importorskip("cmaes")
     out = tmp_path_factory.mktemp("search")
-    options = SearchOptions(SearchBudget(24), shrink=1, probability=10, scenes=scene_folder)
-    run_search([BRAKES], "pid", out, options)
+    run_search([BRAKES], "pid", out, options_of(scene_folder))
     return out
+
+
+def options_of(scene_folder: Path, episodes: int = 24) -> SearchOptions:
+    return SearchOptions(SearchBudget(episodes), shrink=1, probability=10, scenes=scene_folder)
+
+
+def contents(out: Path) -> dict[str, bytes]:
+    """The files of a search, by path; without its journal."""
+    files = (path for path in out.rglob("*") if path.is_file() and path.name != JOURNAL)
+    return {str(path.relative_to(out)): path.read_bytes() for path in files}
 
 
 def test_a_blind_planner_is_at_fault_where_the_reference_is_not(evaluate):
@@ -222,12 +246,157 @@ def test_failures_are_saved_as_reproducible_cases_and_recordings(found, scene):
         assert again.criticality == failure["criticality"]
 
 
+class Cheap(Evaluator):
+    """An evaluator with outcomes in closed form, which counts the episodes that it drives."""
+
+    driven = 0
+
+    def _driven(self, drive: Drive) -> dict:
+        self.driven += 1
+        car = drive.reset["agents"]["drivers"]["car_blue"]
+        score = 0.3 - 0.1 * abs(car["gap"] - 7.0) - 0.2 * abs(car["braking"] - 6.1)
+        hit = {"cell": ("front", f"{car['gap'] // 5:g}", "car"), "impact": {"speed": score / 3}}
+        failed = {"at_fault": True, "avoided": True, **hit} if score > 0 else {"at_fault": False}
+        measured = {"score": score, "criticality": score, "implausibility": 0.0}
+        return {"avoided": None, "cell": None, "impact": {}} | measured | failed
+
+
+def test_cut_off_anywhere_the_journal_leads_to_the_same_search(scene, tmp_path):
+    """As after a kill at the end of each episode, or in the middle of the next one's record."""
+    pytest.importorskip("cmaes")
+
+    def searched(folder: Path, journal: bytes) -> tuple[Cheap, list, list]:
+        folder.mkdir()
+        (folder / JOURNAL).write_bytes(journal)
+        with Journal(folder / JOURNAL) as opened:
+            evaluate = Cheap(scene, [BRAKES], "pid", journal=opened)
+            state = search(evaluate, SearchBudget(14))
+            edges = [boundaries(evaluate, e) for e in state.archive.ordered()[:1]]
+        return evaluate, [vars(e) for e in state.evaluations], edges
+
+    whole, *expected = searched(tmp_path / "whole", b"")
+    assert any(e["cell"] for e in expected[0])
+    lines = (tmp_path / "whole" / JOURNAL).read_bytes().splitlines(keepends=True)
+    assert len(lines) == whole.driven + 1
+    for known in range(whole.driven):
+        kept = b"".join(lines[: known + 1]) + lines[known + 1][: 20 * (known % 3)]
+        resumed, *found = searched(tmp_path / str(known), kept)
+        assert found == expected
+        assert known + resumed.driven == whole.driven
+
+
+def test_a_resumed_search_ends_with_the_same_files(found, scene_folder, tmp_path):
+    lines = (found / JOURNAL).read_bytes().splitlines(keepends=True)
+    kept = len(lines) * 3 // 4
+    (tmp_path / JOURNAL).write_bytes(b"".join(lines[:kept]) + lines[kept][:-9])
+    report = run_search([BRAKES], "pid", tmp_path, options_of(scene_folder))
+    assert contents(tmp_path) == contents(found)
+    assert report["driven_now"] == len(lines) - kept
+
+
+def test_a_longer_search_drives_only_further_episodes(found, scene_folder, tmp_path):
+    (tmp_path / JOURNAL).write_bytes((found / JOURNAL).read_bytes())
+    options = replace(options_of(scene_folder, 30), shrink=0, probability=0)
+    report = run_search([BRAKES], "pid", tmp_path, options)
+    assert report["episodes"] == 30
+    assert report["driven_now"] <= 6
+
+
+KILLED_AFTER_THIRTY = """
+import os, signal
+from real2sim.cli import main
+from real2sim_server.sweeps.sweep import Journal
+add = Journal.add
+def add_and_die(self, key, row):
+    add(self, key, row)
+    if len(self.rows) == 30:
+        os.kill(os.getpid(), signal.SIGKILL)
+Journal.add = add_and_die
+main()
+"""
+
+
+@pytest.mark.slow
+def test_a_killed_search_ends_with_the_same_files_when_it_is_run_again(
+    found, scene_folder, tmp_path
+):
+    space, out = tmp_path / "space.json", tmp_path / "out"
+    space.write_text(BRAKES.model_dump_json(exclude_unset=True))
+    command = ["search", str(space), "--planner", "pid", "--out", str(out), "--episodes", "24"]
+    command += ["--shrink", "1", "--probability", "10", "--scenes", str(scene_folder)]
+    ended = subprocess.call([sys.executable, "-c", KILLED_AFTER_THIRTY, *command])
+    assert ended == -signal.SIGKILL
+    assert {path.name for path in out.iterdir()} >= {JOURNAL}
+    assert not (out / FAILURES).exists()
+    figures = tmp_path / "figures.json"
+    done = CliRunner().invoke(build_app(), [*command, "--json", str(figures)])
+    assert done.exit_code == 0, done.output
+    assert contents(out) == contents(found)
+    driven = len(Journal(found / JOURNAL).rows)
+    assert json.loads(figures.read_text())["driven_now"] == driven - 30
+
+
+def test_episodes_of_a_changed_planner_are_not_taken_from_the_journal(tmp_path, monkeypatch):
+    keys = []
+    for speed in (5.0, 6.0):
+        source = tmp_path / f"{speed:g}" / "own_planner.py"
+        source.parent.mkdir()
+        source.write_text(f"class Own:\n    speed = {speed}\n")
+        module = SimpleNamespace(__file__=str(source))
+        monkeypatch.setitem(sys.modules, "own_planner", module)
+        keys.append(Drive("own_planner:Own", {}).key(""))
+    assert keys[0] != keys[1]
+
+
+def test_another_file_is_not_overwritten_as_a_journal_of_a_search(scene_folder, tmp_path):
+    (tmp_path / JOURNAL).write_text("something else\n")
+    with pytest.raises(CommandError, match="not a journal"):
+        run_search([BRAKES], "pid", tmp_path, options_of(scene_folder))
+
+
 def test_the_page_reports_what_was_found(found):
     page = (found / PAGE).read_text()
     report = json.loads((found / FAILURES).read_text())
     assert f"{report['avoidable']} avoidable collisions" in page
     assert page.count('class="card"') == report["cells"]
+    assert page.count(">ego</text>") == page.count(">10 m</text>") == report["cells"]
     assert "Probability of a collision at fault" in page
+
+
+def test_the_page_draws_the_lanes_around_the_ego(found):
+    """A lane of 3.5 m along the ego, in the middle of a view of 44 m; one far away is left out."""
+    report = json.loads((found / FAILURES).read_text())
+    recording = load_recording(found / "recordings" / "failure_01.r2e")
+    ego = recording.instants[-1].ego
+    along = np.array([math.cos(ego.yaw), math.sin(ego.yaw), 0.0])
+    centre = np.array([ego.x, ego.y, 0.0]) + np.outer([-90.0, 90.0], along)
+    lanes = [
+        Lane(name, "driving", centre + np.array([0.0, aside, 0.0]), np.full(2, 3.5))
+        for name, aside in (("near", 0.0), ("far", 500.0))
+    ]
+    context = replace(recording.context, road_map=RoadMap(LaneGraph.of(lanes)))
+    shown = SimpleNamespace(cell=None, impact={}, values={})
+    mapped = replace(recording, context=context)
+    failure = Failure("failure_01", shown, mapped, True, None, [], "films/failure_01.mp4")
+    page = render_page(report, [failure])
+    assert 'poster="films/failure_01.jpg"' in page
+    [points] = re.findall(r'<polygon points="([^"]*)" [^>]*stroke=', page)
+    across = {float(point.split(",")[0]) for point in points.split()}
+    half = 1.75 * 300 / 44
+    assert sorted(across) == pytest.approx([150 - half, 150 + half], abs=0.1)
+
+
+def test_a_film_has_its_last_image_as_poster(found, scene, tmp_path):
+    recording = load_recording(found / "recordings" / "failure_01.r2e")
+    film, poster = tmp_path / "a.mp4", tmp_path / "a.jpg"
+    film_episode(recording, recording.replayer(scene), scene, film, width=64, poster=poster)
+    video, last = cv2.VideoCapture(str(film)), None
+    while (frame := video.read())[0]:
+        last = frame[1]
+    assert last is not None
+    # Films have an even number of rows.
+    shown = cv2.imread(str(poster))[: len(last)]
+    assert np.abs(shown.astype(float) - last).mean() < 12.0
 
 
 def test_boundaries_separate_failures_from_passes(evaluate):

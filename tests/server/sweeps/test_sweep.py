@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -86,6 +87,17 @@ def test_recordings_of_the_worst_episodes_replay_identically(alone, tiny_scene, 
             first_difference(recording, recording.replayer(load_scene(scene_folder / "tiny")))
             is None
         )
+
+
+def test_replay_finds_a_scene_by_the_name_that_the_sweep_gave(alone, scene_folder, tmp_path):
+    recording, figures = next((alone / RECORDINGS).iterdir()), tmp_path / "figures.json"
+    command = ["replay", str(recording), "--json", str(figures), "--scenes", str(scene_folder)]
+    done = CliRunner().invoke(build_app(), [*command, "--scene", "tiny"])
+    assert done.exit_code == 0, done.output
+    assert json.loads(figures.read_text())["bit_identical"]
+    unknown = CliRunner().invoke(build_app(), [*command, "--scene", "nowhere"])
+    assert unknown.exit_code == 1
+    assert "no scene 'nowhere'" in unknown.output
 
 
 def test_recordings_may_be_read_by_whom_the_umask_allows(alone):

@@ -109,7 +109,10 @@ def test_a_search_saves_its_failures_and_an_archive(client, tmp_path):
     found = json.loads(left(client, job, "failures.json"))
     assert found["episodes"] == job["result"]["episodes"] == 20
     assert len(found["failures"]) == len(job["result"]["failures"])
-    assert str(tmp_path).encode() not in left(client, job, "failures.tar")
+    archive = left(client, job, "failures.tar")
+    assert b"failures.html" in archive
+    assert b"search.journal" not in archive
+    assert str(tmp_path).encode() not in archive
 
 
 @pytest.mark.slow
@@ -129,6 +132,20 @@ def test_a_sweep_resumes_after_a_worker_restart(start_worker, run_worker, tmp_pa
         done = over(client, client.get(f"/v1/jobs/{job['job_id']}").json())
         assert (done["state"], done["result"]["episodes"]) == ("succeeded", 100)
         assert 0 < done["result"]["driven_now"] < 100
+
+
+def test_a_search_resumes_after_a_worker_restart(start_worker, run_worker, tmp_path):
+    pytest.importorskip("cmaes")
+    ask = {"kind": "search", "episodes": 40, "shrink": 0}
+    body = {name: value for name, value in CUT_IN.items() if name != "worst"}
+    body |= {"method": ask, "planners": ["follow_route"]}
+    with run_worker() as client:
+        job = client.post("/v1/sweeps", json=body).json()
+        wait_driving(client, job)
+    with run_worker() as client:
+        done = over(client, client.get(f"/v1/jobs/{job['job_id']}").json())
+        assert (done["state"], done["result"]["episodes"]) == ("succeeded", 40)
+        assert 0 < done["result"]["driven_now"] < 40
 
 
 REFUSED = (
