@@ -226,7 +226,7 @@ class LaneOffsetAction(Model):
     """Lateral offset from the centre of its lane, or from an entity."""
 
     kind: Literal["lane_offset"] = "lane_offset"
-    offset: Value = Field(description="positive to the left [m]")
+    offset: Value = Field(description="positive to the left of the lane or the entity [m]")
     relative_to: Reference | None = None
     continuous: bool = False
     shape: Shape = "step"
@@ -299,6 +299,10 @@ class Vertex(Model):
 
     time: Value = 0.0
     position: Position
+    oriented: bool = Field(
+        default=False,
+        description="whether the position gives the heading from here on; else it is the line's",
+    )
 
 
 class Polyline(Model):
@@ -355,13 +359,19 @@ class ClothoidPiece(Model):
     end: Value
     length: Value
     end_time: Value | None = None
+    turn: Value = Field(default=0.0, description="turn at its start [rad]")
+    position: Position | None = Field(
+        default=None, description="its start; default: the end of the previous one"
+    )
 
 
 class ClothoidSpline(Model):
-    """Clothoid segments, each continuing the previous one in position and heading."""
+    """Clothoid segments, each continuing the previous one unless it has a position of its own."""
 
     shape: Literal["clothoid_spline"] = "clothoid_spline"
-    position: Position
+    position: Position | None = Field(
+        default=None, description="its start; default: where the entity is"
+    )
     pieces: list[ClothoidPiece] = Field(min_length=1, max_length=1000)
 
 
@@ -464,7 +474,7 @@ PrivateAction = Annotated[
 
 
 class AddEntityAction(Model):
-    """Adds an entity to the world."""
+    """Adds an entity to the world; without effect if it is there."""
 
     kind: Literal["add_entity"] = "add_entity"
     entity: Reference

@@ -78,6 +78,24 @@ class Distance(Entities, Distances):
     position: Position
 
 
+class RelativeClearance(Entities):
+    """A lane beside the own one, or the own one, exists and has no entity near along the road."""
+
+    kind: Literal["relative_clearance"] = "relative_clearance"
+    ahead: Value = Field(default=0.0, description="distance ahead that must be clear [m]")
+    behind: Value = Field(default=0.0, description="distance behind that must be clear [m]")
+    lanes: list[tuple[int, int]] = Field(
+        default_factory=list,
+        max_length=64,
+        description="ranges of lanes, positive to the left, 0 the own one; empty: all",
+    )
+    opposite: bool = Field(default=False, description="also lanes of the other direction")
+    others: list[Reference] = Field(
+        default_factory=list, max_length=64, description="entities; empty: all others"
+    )
+    freespace: bool = Field(default=False, description="from box to box")
+
+
 class ReachPosition(Entities):
     """Within a tolerance [m] of a position."""
 
@@ -205,6 +223,7 @@ Test = Annotated[
     | TimeHeadway
     | RelativeDistance
     | Distance
+    | RelativeClearance
     | ReachPosition
     | Speed
     | Acceleration

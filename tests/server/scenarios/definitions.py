@@ -254,14 +254,15 @@ def hesitating(stop: float, pause: float, **parameters: float) -> Definition:
 
 
 def junction(ahead: float, distance: float, speed: float) -> Definition:
-    """Acceleration changes linearly, so that its way is a cubic with its speed at both ends."""
+    """One acceleration up to half of the time, and its opposite then."""
     arrival = ahead / EGO_SPEED
     excess = distance - speed * arrival
 
     def course(t: float) -> tuple[float, float, float]:
         u = min(t / arrival, 1.0)
-        way = speed * t + excess * (3 * u**2 - 2 * u**3)
-        return ahead, way - distance, speed + excess * 6 * u * (1 - u) / arrival
+        share, slope = (2 * u**2, 4 * u) if u < 0.5 else (1 - 2 * (1 - u) ** 2, 4 * (1 - u))
+        way = speed * t + excess * share
+        return ahead, way - distance, speed + excess * slope / arrival
 
     return Definition({"meet": 0.0}, {"crosser": course})
 

@@ -340,6 +340,14 @@ def test_an_element_without_effect_is_noted_and_the_drive_stays_the_same(run, ta
     assert drives[0] == drives[1]
 
 
+def test_a_friction_is_noted(run):
+    slippery = with_ignored("EnvironmentAction").replace('Factor="1.0"', 'Factor="0.5"')
+    found = run(slippery)
+
+    assert "frictionScaleFactor of <RoadCondition> is ignored:" in " ".join(found.output.split())
+    assert found.exit_code == 0
+
+
 @pytest.mark.parametrize("tag", IGNORED)
 def test_a_strict_run_refuses_an_element_without_effect(run, tag):
     found = run(with_ignored(tag), "--strict")
@@ -623,6 +631,70 @@ def test_an_offset_relative_to_an_entity_is_measured_from_the_entity(run):
     found = run(scenario(actor="Ego", action=action)).ego
 
     assert found[-1].y == pytest.approx(-1.75 - 1.0)
+
+
+def test_beside_the_lane_centre_of_a_bend_the_speed_is_that_of_the_motion(run):
+    start = '<LanePosition roadId="2" laneId="-1" s="10" offset="1.5"/>'
+    target = private("Target", put(lane(1, 100.0)))
+    ego = run(scenario(init=private("Ego", put(start), speed(10.0)) + target), seconds=3.0).ego
+
+    angles = [math.atan2(e.x - 600.0, RADIUS - e.y) for e in ego]
+    assert angles[-1] - angles[0] == pytest.approx(30.0 / (RADIUS + 1.75 - 1.5), abs=2e-4)
+
+
+def test_a_heading_in_a_lane_is_that_of_its_centre_line(run, tmp_path):
+    widening = ROAD.replace('a="3.5" b="0"', 'a="3.5" b="0.02"')
+    (tmp_path / "widening.xodr").write_text(widening)
+    init = private("Ego", put(lane(-1, 50.0))) + private("Target", put(lane(1, 100.0)))
+    ego = run(scenario(init=init), "--roads", str(tmp_path / "widening.xodr"), seconds=1.0).ego[0]
+
+    # The centre line of the lane moves away from the reference line by half of its width.
+    assert ego.yaw == pytest.approx(-math.atan(0.01), abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("lanes", "opposite", "begins"),
+    [
+        # The ego is 10 m behind in the same lane and falls back by 10 m/s.
+        ((0, 0), "false", [1.01]),
+        ((-1, -1), "false", [0.0]),
+        ((1, 1), "false", []),
+        ((1, 1), "true", [0.0]),
+    ],
+)
+def test_a_clearance_needs_a_lane_without_entities(run, lanes, opposite, begins):
+    clear = f"""<StartTrigger><ConditionGroup><Condition name="clear" delay="0"
+    conditionEdge="none"><ByEntityCondition><TriggeringEntities
+    triggeringEntitiesRule="any"><EntityRef entityRef="Target"/></TriggeringEntities>
+    <EntityCondition><RelativeClearanceCondition distanceForward="5" distanceBackward="20"
+    freeSpace="false" oppositeLanes="{opposite}"><RelativeLaneRange from="{lanes[0]}"
+    to="{lanes[1]}"/></RelativeClearanceCondition></EntityCondition></ByEntityCondition>
+    </Condition></ConditionGroup></StartTrigger>"""
+    init = private("Ego", put(lane(-1, 100.0)), speed(0.0))
+    init += private("Target", put(lane(-1, 110.0)), speed(10.0))
+    found = run(scenario(init=init, event_start=clear), seconds=2.0)
+
+    assert found.begins("event") == pytest.approx(begins, abs=0.011)
+
+
+def test_a_clothoid_spline_starts_where_its_pieces_say(run):
+    segment = """<ClothoidSplineSegment curvatureStart="0" curvatureEnd="0" length="{}"{}>{}
+    </ClothoidSplineSegment>"""
+    there = '<PositionStart><WorldPosition x="80" y="20" h="0"/></PositionStart>'
+    action = f"""<RoutingAction><FollowTrajectoryAction><TrajectoryRef>
+    <Trajectory name="t" closed="false"><Shape><ClothoidSpline>
+    {segment.format(10, "", "")}{segment.format(10, ' hOffset="0.5"', there)}</ClothoidSpline>
+    </Shape></Trajectory></TrajectoryRef><TimeReference><None/></TimeReference>
+    <TrajectoryFollowingMode followingMode="position"/></FollowTrajectoryAction></RoutingAction>"""
+    ego = run(scenario(actor="Ego", action=action, event_start=""), seconds=1.8).ego
+
+    # 10 m straight on from where it is, then 8 m from the start of the second piece.
+    assert (ego[8].x - ego[0].x, ego[8].y - ego[0].y) == pytest.approx((8.0, 0.0), abs=0.01)
+    last, way = ego[18], 8.0 + ego[0].x - 50.0
+    assert last.yaw == pytest.approx(0.5)
+    assert (last.x, last.y) == pytest.approx(
+        (80.0 + way * math.cos(0.5), 20.0 + way * math.sin(0.5)), abs=0.15
+    )
 
 
 def test_a_route_changes_lanes_without_turning_back(run):

@@ -157,7 +157,11 @@ class Positions:
 
     def _polyline(self, part: Part) -> Fields:
         vertices = [
-            {"time": v.number("time", 0.0), "position": self.position(v.child("Position"))}
+            {
+                "time": v.number("time", 0.0),
+                "position": self.position(v.child("Position")),
+                "oriented": _is_oriented(v.child("Position")),
+            }
             for v in part.children("Vertex")
         ]
         return {"shape": "polyline", "vertices": vertices}
@@ -178,18 +182,18 @@ class Positions:
         part.number_or_none("timeEnd")
         segments = part.children("ClothoidSplineSegment")
         starts = [s.find("PositionStart") for s in segments]
-        if not starts or starts[0] is None or any(s is not None for s in starts[1:]):
-            raise part.error(
-                "<ClothoidSpline> is supported with <PositionStart> in its first segment alone"
-            )
+        if not segments:
+            raise part.error("<ClothoidSpline> has no <ClothoidSplineSegment>")
         pieces = [
             {
                 "start": s.number("curvatureStart"), "end": s.number("curvatureEnd"),
                 "length": s.number("length"), "end_time": s.number_or_none("timeEnd"),
+                "turn": s.number("hOffset", 0.0),
+                "position": self.position(start) if start is not None and k else None,
             }
-            for s in segments
+            for k, (s, start) in enumerate(zip(segments, starts, strict=True))
         ]  # fmt: skip
-        position = self.position(starts[0])
+        position = None if starts[0] is None else self.position(starts[0])
         return {"shape": "clothoid_spline", "position": position, "pieces": pieces}
 
     def _nurbs(self, part: Part) -> Fields:
@@ -237,6 +241,16 @@ _SHAPES: dict[str, Callable[[Positions, Part], Fields]] = {
     "ClothoidSpline": Positions._spline,
     "Nurbs": Positions._nurbs,
 }
+
+
+def _is_oriented(position: Part) -> bool:
+    """Whether a position in the file gives a heading."""
+    return any(
+        "h" in found.attributes
+        for kind in position.raw.children
+        for found in (kind, *kind.children)
+        if found.tag in {"WorldPosition", "Orientation"}
+    )
 
 
 def signal_state(part: Part) -> Fields:
@@ -355,6 +369,16 @@ class Conditions:
         place = self._positions.position(part.child("Position"))
         return {"kind": "distance", "position": place, **_ruled(part), **_measured(part)}
 
+    def _clearance(self, part: Part) -> Fields:
+        lanes = [(r.integer("from"), r.integer("to")) for r in part.children("RelativeLaneRange")]
+        return {
+            "kind": "relative_clearance", "lanes": lanes,
+            "ahead": part.number("distanceForward", 0.0),
+            "behind": part.number("distanceBackward", 0.0),
+            "opposite": part.flag("oppositeLanes"), "freespace": part.flag("freeSpace"),
+            "others": [e.text("entityRef") for e in part.children("EntityRef")],
+        }  # fmt: skip
+
     def _reach(self, part: Part) -> Fields:
         place = self._positions.position(part.child("Position"))
         return {
@@ -443,6 +467,7 @@ _BY_ENTITY: dict[str, Any] = {
     "TimeHeadwayCondition": Conditions._headway,
     "RelativeDistanceCondition": Conditions._relative_distance,
     "DistanceCondition": Conditions._distance,
+    "RelativeClearanceCondition": Conditions._clearance,
     "ReachPositionCondition": Conditions._reach,
     "SpeedCondition": Conditions._speed,
     "RelativeSpeedCondition": Conditions._speed,
@@ -643,13 +668,17 @@ class Actions:
     # --- global ---------------------------------------------------------------------------------
 
     def _environment(self, part: Part) -> Fields:
-        """Weather has no effect, except for a friction other than 1, which is refused."""
+        """Weather and friction have no effect on the entities, which follow their actions."""
         found = part.only({"Environment", "CatalogReference"})
         is_named = found.tag == "CatalogReference"
         found = self._positions.entry(found, "Environment") if is_named else scoped(found)
         road = found.find("RoadCondition")
         if road is not None and road.number("frictionScaleFactor", 1.0) != 1.0:
-            raise road.error("frictionScaleFactor must be 1")
+            road.ignore_attribute(
+                "frictionScaleFactor",
+                "entities follow their actions; `vehicle.friction` of a reset is that of the ego's "
+                "tyres",
+            )
         part.ignore("images show the scene in its own weather and light")
         read_all(found.raw)
         return {"kind": "custom", "type": part.tag}

@@ -454,9 +454,14 @@ def _trajectory(parent: Element, curve: Mapping[str, Any], name: str, closed: bo
     if kind == "polyline":
         line = _add(shape, "Polyline")
         for vertex in curve["vertices"]:
-            _position(
-                _add(_add(line, "Vertex", time=vertex["time"]), "Position"), vertex["position"]
-            )
+            place = _add(_add(line, "Vertex", time=vertex["time"]), "Position")
+            _position(place, vertex["position"])
+            if not vertex["oriented"]:
+                place[0].attrib.pop("h", None)
+                for orientation in place[0].findall("Orientation"):
+                    place[0].remove(orientation)
+            elif place[0].tag != "WorldPosition" and place[0].find("Orientation") is None:
+                _add(place[0], "Orientation", type="relative", h=0.0)
     elif kind == "clothoid":
         made = _add(shape, "Clothoid", curvature=curve["curvature"], length=curve["length"],
                     curvaturePrime=curve["curvature_rate"], startTime=curve["start_time"],
@@ -467,9 +472,10 @@ def _trajectory(parent: Element, curve: Mapping[str, Any], name: str, closed: bo
         for k, piece in enumerate(curve["pieces"]):
             made = _add(spline, "ClothoidSplineSegment", curvatureStart=piece["start"],
                         curvatureEnd=piece["end"], length=piece["length"],
-                        timeEnd=piece["end_time"])  # fmt: skip
-            if k == 0:
-                _position(_add(made, "PositionStart"), curve["position"])
+                        timeEnd=piece["end_time"], hOffset=piece["turn"])  # fmt: skip
+            position = piece["position"] if k else curve["position"]
+            if position is not None:
+                _position(_add(made, "PositionStart"), position)
     else:
         made = _add(shape, "Nurbs", order=curve["order"])
         for point in curve["points"]:
@@ -528,7 +534,7 @@ _BY_VALUE: dict[str, Any] = {
 }  # fmt: skip
 
 
-def _by_entity(parent: Element, kind: str, t: Mapping[str, Any]) -> None:
+def _by_entity(parent: Element, kind: str, t: Mapping[str, Any]) -> None:  # noqa: PLR0912
     if kind == "time_to_collision":
         part = _add(parent, "TimeToCollisionCondition", **_ruled(t), **_measured(t))
         target = _add(part, "TimeToCollisionConditionTarget")
@@ -542,6 +548,14 @@ def _by_entity(parent: Element, kind: str, t: Mapping[str, Any]) -> None:
     elif kind == "distance":
         part = _add(parent, "DistanceCondition", **_ruled(t), **_measured(t))
         _position(_add(part, "Position"), t["position"])
+    elif kind == "relative_clearance":
+        part = _add(parent, "RelativeClearanceCondition", distanceForward=t["ahead"],
+                    distanceBackward=t["behind"], freeSpace=t["freespace"],
+                    oppositeLanes=t["opposite"])  # fmt: skip
+        for low, high in t["lanes"]:
+            _add(part, "RelativeLaneRange", **{"from": low, "to": high})
+        for name in t["others"]:
+            _add(part, "EntityRef", entityRef=name)
     elif kind == "reach_position":
         part = _add(parent, "ReachPositionCondition", tolerance=t["tolerance"])
         _position(_add(part, "Position"), t["position"])

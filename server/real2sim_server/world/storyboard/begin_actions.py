@@ -96,6 +96,8 @@ def _freed(actor: EntityState) -> EntityState:
         return actor
     course = actor.trajectory.course
     places = [Place(float(x), float(y), 0.0) for x, y in zip(course.x, course.y, strict=True)]
+    if course.sense(actor.trajectory.s) < 0.0:
+        places.reverse()
     way = Way("trajectory", 1, True, path_through(places))
     return copy_with(actor, trajectory=None).on_way(way)
 
@@ -239,7 +241,7 @@ def _lane_offset(actor: EntityState, action: LaneOffsetAction, at: Beginning) ->
     if action.relative_to is not None:
         if action.continuous and acceleration is None:
             return copy_with(actor, lateral=FollowOffset(at.token, action.relative_to, value))
-        value += offset_of(at.view.entities[action.relative_to], actor, at.view)
+        value = offset_of(at.view.entities[action.relative_to], actor, at.view, value)
     if action.continuous and acceleration is None:
         return copy_with(actor, lateral=HoldOffset(at.token, value))
     most = None if acceleration is None else float(acceleration)
@@ -275,7 +277,9 @@ def _lateral_distance(
 def _follow_trajectory(
     actor: EntityState, action: FollowTrajectoryAction, at: Beginning
 ) -> EntityState:
-    course = course_of(action.curve, at.places.of)
+    backwards = action.timing is None and actor.speed < 0.0
+    here = Place(actor.x, actor.y, actor.h)
+    course = course_of(action.curve, at.places.of, here=here, backwards=backwards)
     timing, s = action.timing, float(action.offset)
     if timing is not None and course.times is None:
         raise WorldError(
@@ -283,7 +287,12 @@ def _follow_trajectory(
             f"trajectory {action.name!r} is to be followed by its times and has none",
             hint="give times to its vertices, or leave out `timing`",
         )
-    elapsed = at.view.elapsed if timing is not None and timing.domain == "absolute" else 0.0
+    elapsed = 0.0
+    if timing is not None and timing.domain == "absolute":
+        elapsed = at.view.elapsed
+    elif timing is not None and s > 0.0:
+        # It starts at the time of its offset.
+        elapsed = (course.time_at(s) - float(timing.offset)) / float(timing.scale)
     following = Trajectory(at.token, course, timing, s, elapsed)
     longitudinal = actor.longitudinal if timing is None else None
     actor = copy_with(

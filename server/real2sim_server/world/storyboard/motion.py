@@ -122,7 +122,7 @@ class FollowOffset:
 
     def step(self, actor: EntityState, view: View, way: float, h: float) -> Shifted:
         """The change after ``h`` seconds and ``way`` metres."""
-        return Shifted(self.value + offset_of(view.entities[self.other], actor, view), self)
+        return Shifted(offset_of(view.entities[self.other], actor, view, self.value), self)
 
 
 @dataclass(frozen=True)
@@ -164,9 +164,10 @@ class KeepAside:
         return Shifted(actor.offset + step, None if there and not self.action.continuous else self)
 
 
-def offset_of(other: EntityState, actor: EntityState, view: View) -> float:
-    """Offset of another entity from the path of an entity, along the road between them [m]."""
-    return actor.offset + offsets(actor, Place(other.x, other.y, other.h), "lane", view.network)[1]
+def offset_of(other: EntityState, actor: EntityState, view: View, left: float) -> float:
+    """Offset from an entity's path of a place ``left`` metres to the left of another entity [m]."""
+    to_other = offsets(actor, Place(other.x, other.y, other.h), "lane", view.network)[1]
+    return actor.offset + to_other + math.copysign(left, left * math.cos(other.h - actor.h))
 
 
 DONE = 1e-9
@@ -336,8 +337,9 @@ class Synchronize:
     """Arrives at its target position when the master arrives at its own; solved in every step.
 
     Without a final speed the acceleration is constant, a = 2 (d - v T) / T^2. With a final speed it
-    is linear, a(0) = 6 d / T^2 - (4 v + 2 v_f) / T, over the remaining distance and time before the
-    steady part; a stationary entity waits until a constant acceleration suffices.
+    has one magnitude and changes its sign once, at the speed d / T +- sqrt((d / T)^2 -
+    d (v + v_f) / T + (v^2 + v_f^2) / 2), which needs the smallest acceleration; d and T end before
+    the steady part. If that speed is negative, the entity stops and waits.
     """
 
     token: int
@@ -379,7 +381,7 @@ class Synchronize:
     def _towards_final(
         self, actor: EntityState, left: float, time: float, final: float, h: float
     ) -> Moved:
-        """With a final speed: a linear acceleration to it, then constant speed."""
+        """With a final speed: constant acceleration in two phases, then constant speed."""
         v, (distance, seconds) = actor.speed, self.steady
         if seconds > 0.0:
             distance = seconds * final
@@ -395,15 +397,21 @@ class Synchronize:
                 return Moved(0.0, 0.0, self)
             rate, left_h = final * final / (2.0 * d), h - wait
             return Moved(rate * left_h * left_h / 2, rate * left_h, self)
-        rate = 6 * d / t**2 - (4 * v + 2 * final) / t
-        jerk = 2 * (final - v - rate * t) / t**2
         if t <= h:
             return Moved(d + final * (h - t), final, then)
-        speed = v + rate * h + jerk * h * h / 2
-        if speed < 0.0:
-            way, _ = advance_along(0.0, v, -v / h, h)
-            return Moved(way, 0.0, self)
-        return Moved(v * h + rate * h * h / 2 + jerk * h**3 / 6, speed, self)
+        mean = d / t
+        side = 1.0 if mean >= (v + final) / 2 else -1.0
+        square = mean * mean - mean * (v + final) + (v * v + final * final) / 2
+        peak = mean + side * math.sqrt(max(square, 0.0))
+        if peak < 0.0:
+            # It stops early and waits, with the same rate before and after.
+            way, speed = advance_along(0.0, v, -(v * v + final * final) / (2 * d), h)
+            return Moved(way, speed, self)
+        rate = (2 * peak - v - final) / t
+        first = min(max((peak - v) / rate, 0.0), h) if abs(rate) > DONE else 0.0
+        turned = v + rate * first
+        speed = turned - rate * (h - first)
+        return Moved((v + turned) / 2 * first + (turned + speed) / 2 * (h - first), speed, self)
 
     def _solved(self, d: float, v: float, time: float) -> float:
         """Constant acceleration to arrive in time."""
@@ -494,9 +502,10 @@ def _on_way(actor: EntityState, view: View, way: float, h: float) -> EntityState
             finished |= {control.token}
     # The speed is that of the whole motion, along the path and across it.
     aside = min(abs(offset - actor.offset), abs(way))
+    ahead = math.copysign(math.sqrt(way * way - aside * aside), way)
     moved = copy_with(
         actor,
-        s=actor.s + math.copysign(math.sqrt(way * way - aside * aside), way),
+        s=actor.s + ahead / _stretch(actor),
         offset=offset,
         turn=actor.turn if control is None else 0.0,
         # The lateral motion of a change is over at its end, also if its shape ends abruptly.
@@ -506,6 +515,17 @@ def _on_way(actor: EntityState, view: View, way: float, h: float) -> EntityState
         travelled=actor.travelled + abs(way),
     )
     return _within_road(moved, view).placed()
+
+
+def _stretch(actor: EntityState) -> float:
+    """Distance that an entity covers beside its path, per distance along the path."""
+    if abs(actor.offset) <= AT_PLACE:
+        return 1.0
+    assert actor.way is not None
+    path, reach = actor.way.path, 0.5
+    turn = path.at(actor.s + reach)[3] - path.at(actor.s - reach)[3]
+    bend = math.remainder(turn, math.tau) / (2 * reach)
+    return max(1.0 - bend * actor.offset, 0.1)
 
 
 def _within_road(actor: EntityState, view: View) -> EntityState:
@@ -540,8 +560,10 @@ def _on_trajectory(actor: EntityState, view: View, way: float, h: float) -> Enti
         return copy_with(
             actor, trajectory=then, x=place.x, y=place.y, h=place.h, travelled=travelled, drift=0.0
         )
-    end = before.course.at(before.course.length)
-    beyond = max(before.s + way - before.course.length, 0.0) if before.timing is None else 0.0
+    past = before.s + before.course.sense(before.s) * way
+    last = 0.0 if past <= 0.0 else before.course.length
+    end = before.course.at(last)
+    beyond = math.copysign(abs(past - last), way) if before.timing is None else 0.0
     done = copy_with(actor, finished=actor.finished | {before.token}, travelled=travelled)
     put = done.put(end, view.network)
     return copy_with(put, s=put.s + beyond).placed() if put.way is not None and beyond else put

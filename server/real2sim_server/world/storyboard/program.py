@@ -25,6 +25,7 @@ from real2sim_proto.storyboard_conditions import (
     EndOfRoad,
     Offroad,
     ReachPosition,
+    RelativeClearance,
     RelativeDistance,
     Rule,
     SignalPhase,
@@ -41,10 +42,12 @@ from real2sim_proto.storyboard_conditions import (
 )
 
 from ..common import WorldError
+from .roads import lanes_between
 from .view import (
     EntityState,
     PositionResolver,
     View,
+    along,
     box_corners_of,
     closing_speed,
     corners,
@@ -489,6 +492,75 @@ def _relative_distance(
     return _of_entities(test, context, since, holds)
 
 
+MAX_LANES = 20
+"""Lanes beside the own one that a clearance condition looks at."""
+
+
+def _clearance(
+    test: RelativeClearance, context: ConditionContext, since: Mapping[str, float]
+) -> Outcome:
+    view = context.view
+
+    def exists(actor: EntityState) -> bool:
+        """Whether a lane of the ranges is there, in a direction that counts."""
+        here = view.network.locate(actor.x, actor.y, actor.h)
+        if here is None:
+            return False
+        sense = 1 if math.cos(actor.h - here.h) >= 0.0 else -1
+        for lanes in range(-MAX_LANES, MAX_LANES + 1) if test.lanes else ():
+            if not any(low <= lanes <= high for low, high in test.lanes):
+                continue
+            try:
+                lane = view.network.neighbour(here.road, here.lane, here.s, sense * lanes)
+            except WorldError:
+                continue
+            if test.opposite or (lane < 0) == (here.lane < 0):
+                return True
+        return not test.lanes
+
+    def near(actor: EntityState, other: EntityState) -> bool:
+        lanes, ahead = _apart_on_road(actor, other, view)
+        if lanes is None:
+            return False
+        if test.lanes and not any(low <= lanes <= high for low, high in test.lanes):
+            return False
+        if not test.opposite and math.cos(actor.h - other.h) < 0.0:
+            return False
+        front = back = 0.0
+        if test.freespace:
+            front = (actor.size[0] + other.size[0]) / 2 + actor.centre[0] - other.centre[0]
+            back = actor.size[0] + other.size[0] - front
+        return -float(test.behind) - back < ahead < float(test.ahead) + front
+
+    def holds(actor: EntityState) -> bool:
+        names = test.others or [name for name in view.entities if name != actor.name]
+        others = (view.entities[name] for name in names)
+        return exists(actor) and not any(o.visible and near(actor, o) for o in others)
+
+    return _of_entities(test, context, since, holds)
+
+
+def _apart_on_road(actor: EntityState, other: EntityState, view: View) -> tuple[int | None, float]:
+    """Lanes of another entity to the left of an entity, and its distance ahead [m].
+
+    The number is None where the road does not lead from one to the other.
+    """
+    network = view.network
+    here = network.locate(actor.x, actor.y, actor.h)
+    there = network.locate(other.x, other.y, other.h)
+    ahead = along(actor.h, other.x - actor.x, other.y - actor.y)
+    if here is None or there is None:
+        return None, ahead
+    sense = 1.0 if math.cos(actor.h - here.h) >= 0.0 else -1.0
+    if here.road == there.road:
+        return int(sense) * lanes_between(here.lane, there.lane), sense * (there.s - here.s)
+    road, lane, s, onward = network.onward(here.road, here.lane, here.s, sense * ahead)
+    if road != there.road:
+        return None, ahead
+    sense *= onward
+    return int(sense) * lanes_between(lane, there.lane), ahead + sense * (there.s - s)
+
+
 def _to_place(test: Distance, context: ConditionContext, since: Mapping[str, float]) -> Outcome:
     place = context.places.of(test.position)
     return _of_entities(
@@ -668,6 +740,7 @@ _TESTS: Mapping[type[Any], Callable[[Any, ConditionContext, Mapping[str, float]]
     TimeToCollision: _time_to_collision,
     TimeHeadway: _time_headway,
     RelativeDistance: _relative_distance,
+    RelativeClearance: _clearance,
     Distance: _to_place,
     ReachPosition: _reach_position,
     Speed: _speed,

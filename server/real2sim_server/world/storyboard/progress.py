@@ -34,6 +34,9 @@ from .view import EntityState, PositionResolver, View
 STANDBY, RUNNING, COMPLETE = 0, 1, 2
 STATES = {"standby": STANDBY, "running": RUNNING, "complete": COMPLETE}
 
+BEFORE_ALL, STORYBOARD = -2, -1
+"""Numbers for the time before elements are evaluated, and for the storyboard's own trigger."""
+
 GLOBAL = (
     AddEntityAction,
     DeleteEntityAction,
@@ -72,7 +75,7 @@ class ProgressState(NamedTuple):
         signal_starts, signal_states: traffic signal settings made by actions.
         token: token of the next action.
         over: whether the storyboard has been stopped.
-        fresh: element changes that conditions have not seen yet.
+        fresh: element transitions of the last instant, and the element evaluated at that time.
     """
 
     status: tuple[int, ...]
@@ -84,7 +87,7 @@ class ProgressState(NamedTuple):
     signal_states: Mapping[str, str]
     token: int
     over: bool
-    fresh: frozenset[tuple[int, str]]
+    fresh: Mapping[tuple[int, str], int]
 
 
 class Progress:
@@ -113,7 +116,8 @@ class Progress:
         self._variables = dict(state.variables)
         self._starts, self._states = dict(state.signal_starts), dict(state.signal_states)
         self._token, self._over = state.token, state.over
-        self._before, self._fresh = state.fresh, set[tuple[int, str]]()
+        self._before, self._fresh = state.fresh, dict[tuple[int, str], int]()
+        self._evaluated = BEFORE_ALL
         self.changes: list[ElementChange] = []
 
     @property
@@ -141,13 +145,13 @@ class Progress:
 
     def pass_instant(self, t_us: int, elapsed: float, *, first: bool) -> None:
         """Start and end elements at an instant."""
-        self._fresh, self._now = set(), t_us
+        self._fresh, self._now, self._evaluated = {}, t_us, BEFORE_ALL
         self._end_actions()
         if not self._over:
             context = self._context(elapsed, first=first)
             self._context_now, self._elapsed = context, elapsed
             self._pass_whole()
-        self._before = frozenset(self._fresh)
+        self._before = self._fresh
 
     def move(self, elapsed: float, h: float, *, first: bool) -> None:
         """Move all entities by ``h`` seconds, each based on the current poses of the others."""
@@ -157,7 +161,7 @@ class Progress:
     # --- elements -------------------------------------------------------------------------------
 
     def _pass_whole(self) -> None:
-        if self._program.stop is not None and self._fires(self._program.stop):
+        if self._program.stop is not None and self._fires(self._program.stop, STORYBOARD):
             for story in self._program.stories:
                 self._stop(story)
             self._over = True
@@ -170,13 +174,15 @@ class Progress:
             self._complete_with_children(story)
 
     def _pass_act(self, act: Element) -> None:
-        if self._status[act.number] == STANDBY and (act.start is None or self._fires(act.start)):
+        if self._status[act.number] == STANDBY and (
+            act.start is None or self._fires(act.start, act.number)
+        ):
             for element in act.within():
                 if element.type in {"act", "maneuver_group", "maneuver"}:
                     self._change(element, RUNNING, "start")
         if self._status[act.number] != RUNNING:
             return
-        if act.stop is not None and self._fires(act.stop):
+        if act.stop is not None and self._fires(act.stop, act.number):
             self._stop(act)
             return
         for group in act.children:
@@ -190,7 +196,7 @@ class Progress:
 
     def _pass_event(self, event: Element, maneuver: Element) -> None:
         if self._status[event.number] == STANDBY and (
-            event.start is None or self._fires(event.start)
+            event.start is None or self._fires(event.start, event.number)
         ):
             self._begin_event(event, maneuver)
         if self._status[event.number] == RUNNING:
@@ -202,7 +208,7 @@ class Progress:
         ]
         self._times[event.number] += 1
         if event.spec.priority == "skip" and others:
-            self._fresh.add((event.number, "skip_transition"))
+            self._fresh[event.number, "skip_transition"] = self._evaluated
             self._note(event, "skip")
             if self._times[event.number] >= event.spec.times:
                 self._status[event.number] = COMPLETE
@@ -244,6 +250,7 @@ class Progress:
             if all(self._status[a.number] == COMPLETE for a in each.children):
                 again = self._times[each.number] < each.spec.times
                 self._change(each, STANDBY if again else COMPLETE, "end")
+                self._forget_conditions(each)
 
     def _moves(self, action: Element) -> bool:
         tokens = self._running.get(action.number, {})
@@ -262,6 +269,13 @@ class Progress:
             if element is not group:
                 self._status[element.number] = RUNNING if element.type == "maneuver" else STANDBY
                 self._times[element.number] = 0
+                self._forget_conditions(element)
+
+    def _forget_conditions(self, element: Element) -> None:
+        """Let the edges and delays of an element that may start again begin anew."""
+        for row in element.start.numbers if element.start is not None else ():
+            for number in row:
+                self._conditions.pop(number, None)
 
     def _complete_with_children(self, element: Element) -> None:
         if self._status[element.number] == RUNNING and all(
@@ -279,15 +293,16 @@ class Progress:
                 }
             if self._status[each.number] != COMPLETE:
                 if self._status[each.number] == RUNNING:
-                    self._fresh.add((each.number, "stop_transition"))
+                    self._fresh[each.number, "stop_transition"] = self._evaluated
                     self._note(each, "stop")
                 self._status[each.number] = COMPLETE
         if again:
             self._status[element.number] = STANDBY
+            self._forget_conditions(element)
 
     def _change(self, element: Element, status: int, change: str) -> None:
         self._status[element.number] = status
-        self._fresh.add((element.number, f"{change}_transition"))
+        self._fresh[element.number, f"{change}_transition"] = self._evaluated
         self._note(element, change)
 
     def _note(self, element: Element, change: str) -> None:
@@ -304,10 +319,10 @@ class Progress:
 
     def _global(self, action: Any, t_us: int, elapsed: float) -> None:
         if isinstance(action, AddEntityAction):
-            actor = self.entities[action.entity].put(
-                self._places().of(action.position), self._network
-            )
-            self.entities[action.entity] = copy_with(actor, visible=True)
+            actor = self.entities[action.entity]
+            if not actor.visible:
+                put = actor.put(self._places().of(action.position), self._network)
+                self.entities[action.entity] = copy_with(put, visible=True)
         elif isinstance(action, DeleteEntityAction):
             self.entities[action.entity] = copy_with(self.entities[action.entity], visible=False)
         elif isinstance(action, SignalStateAction):
@@ -328,7 +343,8 @@ class Progress:
 
     # --- context ----------------------------------------------------------------------------------
 
-    def _fires(self, start: Start) -> bool:
+    def _fires(self, start: Start, number: int) -> bool:
+        self._evaluated = number
         return is_triggered(start.trigger, start.numbers, self._context_now)
 
     def _context(self, elapsed: float, *, first: bool) -> ConditionContext:
@@ -347,7 +363,13 @@ class Progress:
         elements = self._program.named(type_, name)
         if state in STATES:
             return any(self._status[e.number] == STATES[state] for e in elements)
-        return any((e.number, state) in self._before for e in elements)
+        # Each condition sees a transition once: at this instant if it is evaluated after it, else
+        # at the next one.
+        keys = [(e.number, state) for e in elements]
+        return any(
+            key in self._fresh or self._before.get(key, BEFORE_ALL) >= self._evaluated
+            for key in keys
+        )
 
     def _view(self, elapsed: float, *, first: bool) -> View:
         return View(elapsed, first, self.entities, self._network, self._surroundings)

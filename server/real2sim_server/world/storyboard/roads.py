@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -190,6 +191,11 @@ def skipping_zero(lane: int, lanes: int) -> int:
     found = lane + lanes
     crossed = (lane < 0) != (found < 0) or found == 0
     return found + (1 if lanes > 0 else -1) if crossed and lanes else found
+
+
+def lanes_between(lane: int, other: int) -> int:
+    """Number of lanes from one to another in +t direction; there is no lane 0."""
+    return other - lane - (0 if (lane < 0) == (other < 0) else 1 if other > lane else -1)
 
 
 def straight(x: float, y: float, h: float, *, z: float = 0.0) -> LoggedPath:
@@ -394,9 +400,8 @@ class SampledCurve:
     Attributes:
         s: [N] distance from the start, not decreasing [m].
         x, y: [N] [m].
-        h: [N] continuous heading [rad].
+        h: [N] continuous heading of the entity [rad]; against the curve if it reverses along it.
         times: [N] target times [s], or None.
-        turns: whether headings are interpolated; else each one holds up to the next sample.
     """
 
     s: Float
@@ -404,7 +409,6 @@ class SampledCurve:
     y: Float
     h: Float
     times: Float | None
-    turns: bool
 
     @property
     def length(self) -> float:
@@ -413,16 +417,25 @@ class SampledCurve:
 
     def at(self, s: float) -> Place:
         """The place at a distance from the start."""
-        x, y = float(np.interp(s, self.s, self.x)), float(np.interp(s, self.s, self.y))
-        if self.turns:
-            return Place(x, y, float(np.interp(s, self.s, self.h)))
-        k = int(np.searchsorted(self.s, s, side="right")) - 1
-        return Place(x, y, float(self.h[min(max(k, 0), len(self.h) - 1)]))
+        x, y, h = (float(np.interp(s, self.s, values)) for values in (self.x, self.y, self.h))
+        return Place(x, y, h)
+
+    def sense(self, s: float) -> float:
+        """1 if the entity faces along the curve at a distance from its start, -1 if against it."""
+        k = min(max(int(np.searchsorted(self.s, s, side="right")), 1), len(self.s) - 1)
+        dx, dy = self.x[k] - self.x[k - 1], self.y[k] - self.y[k - 1]
+        h = float(np.interp(s, self.s, self.h))
+        return -1.0 if dx * math.cos(h) + dy * math.sin(h) < -1e-12 else 1.0
 
     def distance_at(self, time: float) -> float:
         """Distance from the start at a time; the curve must have times."""
         assert self.times is not None
         return float(np.interp(time, self.times, self.s))
+
+    def time_at(self, s: float) -> float:
+        """Time at a distance from the start; the curve must have times."""
+        assert self.times is not None
+        return float(np.interp(s, self.s, self.times))
 
     def nearest(self, x: float, y: float) -> float:
         """Distance from the start to the point of the curve nearest to (x, y)."""
@@ -453,24 +466,25 @@ class Trajectory:
     elapsed: float
 
     def ahead(self, x: float, y: float) -> float:
-        """Distance ahead to a place along the curve [m]."""
-        return self.course.nearest(x, y) - self.s
+        """Distance ahead of the entity to a place along the curve [m]."""
+        return self.course.sense(self.s) * (self.course.nearest(x, y) - self.s)
 
     def step(self, way: float, h: float) -> tuple[float, Trajectory | None]:
         """Distance covered in ``h`` seconds, by its times or as given, and the new state.
 
-        The state is None at the end of the curve.
+        The state is None at the end of the curve, or at its start if the entity moves back.
         """
+        sense = self.course.sense(self.s)
         if self.timing is None:
-            s = self.s + way
-            over = s >= self.course.length - 1e-9
+            s = self.s + sense * way
+            over = s >= self.course.length - 1e-9 or (s <= 0.0 and sense * way < 0.0)
             return way, None if over else replace(self, s=s)
         elapsed = self.elapsed + h
         time = elapsed * float(self.timing.scale) + float(self.timing.offset)
         s = self.course.distance_at(time)
         assert self.course.times is not None
         over = time >= self.course.times[-1] - 1e-9
-        return s - self.s, None if over else replace(self, s=s, elapsed=elapsed)
+        return sense * (s - self.s), None if over else replace(self, s=s, elapsed=elapsed)
 
     def begun(self) -> bool:
         """Whether its first time has been reached."""
@@ -484,20 +498,41 @@ class Trajectory:
         return self.course.at(self.s)
 
 
-def course_of(curve: Curve, resolve: Callable[[Any], Place]) -> SampledCurve:
-    """Sample a curve; ``resolve`` turns its positions into places.
+def course_of(
+    curve: Curve,
+    resolve: Callable[[Any], Place],
+    *,
+    here: Place | None = None,
+    backwards: bool = False,
+) -> SampledCurve:
+    """Sample a curve.
+
+    Args:
+        curve: the curve.
+        resolve: turns its positions into places.
+        here: place of the entity, where splines without a position start.
+        backwards: whether the entity faces against the curve, except where vertices give headings.
 
     Raises:
-        WorldError: INVALID_REQUEST for a curve without length.
+        WorldError: INVALID_REQUEST for a curve without a start or length.
     """
     if isinstance(curve, Polyline):
-        course = _polyline(curve, resolve)
+        course = _polyline(curve, resolve, math.pi if backwards else 0.0)
     elif isinstance(curve, Clothoid):
         course = _clothoid(curve, resolve(curve.position))
     elif isinstance(curve, ClothoidSpline):
-        course = _spline(curve.pieces, resolve(curve.position))
+        start = here if curve.position is None else resolve(curve.position)
+        if start is None:
+            raise WorldError(
+                ErrorCode.INVALID_REQUEST,
+                "a clothoid spline has no start, and no entity follows it",
+                hint="give the `position` of its start",
+            )
+        course = _spline(curve.pieces, start, resolve)
     else:
         course = _nurbs(curve, [resolve(p.position) for p in curve.points])
+    if backwards and not isinstance(curve, Polyline):
+        course = replace(course, h=course.h + math.pi)
     if course.length <= 0.0 and course.times is None:
         raise WorldError(
             ErrorCode.INVALID_REQUEST,
@@ -507,7 +542,11 @@ def course_of(curve: Curve, resolve: Callable[[Any], Place]) -> SampledCurve:
     return course
 
 
-def _polyline(curve: Polyline, resolve: Callable[[Any], Place]) -> SampledCurve:
+CORNER = 2.0
+"""Distance before and after a vertex of a polyline within which the heading turns [m]."""
+
+
+def _polyline(curve: Polyline, resolve: Callable[[Any], Place], turn: float) -> SampledCurve:
     places = [resolve(v.position) for v in curve.vertices]
     x, y = np.array([p.x for p in places]), np.array([p.y for p in places])
     times = np.array([float(v.time) for v in curve.vertices])
@@ -518,17 +557,38 @@ def _polyline(curve: Polyline, resolve: Callable[[Any], Place]) -> SampledCurve:
             hint="order its vertices by time",
         )
     steps = np.hypot(np.diff(x), np.diff(y))
-    h = np.empty(len(x))
-    first = next((k for k, step in enumerate(steps) if step > 1e-9), None)
-    heading = places[0].h
-    if first is not None:
-        heading = math.atan2(y[first + 1] - y[first], x[first + 1] - x[first])
-    for k, step in enumerate(steps):
-        if step > 1e-9:
-            heading = math.atan2(y[k + 1] - y[k], x[k + 1] - x[k])
-        h[k] = heading
-    h[-1] = heading
-    return SampledCurve(np.concatenate([[0.0], np.cumsum(steps)]), x, y, h, times, turns=False)
+    s = np.concatenate([[0.0], np.cumsum(steps)])
+    drawn = np.flatnonzero(steps > 1e-9)
+    if not len(drawn):
+        return SampledCurve(s, x, y, np.full(len(x), places[0].h), times)
+    along = np.arctan2(np.diff(y), np.diff(x)) + turn
+    for k, vertex in enumerate(curve.vertices[:-1]):
+        if vertex.oriented:
+            along[k] = places[k].h
+    last = places[-1].h if curve.vertices[-1].oriented else along[drawn[-1]]
+    knots = [(0.0, along[drawn[0]])]
+    for before, after in itertools.pairwise(drawn):
+        # The heading turns within CORNER of the vertex between two segments.
+        change = math.remainder(along[after] - along[before], math.tau)
+        knots += [
+            (s[after] - min(CORNER, steps[before] / 2), along[before]),
+            (s[after], along[before] + change / 2),
+            (s[after] + min(CORNER, steps[after] / 2), along[after]),
+        ]
+    knots += [(s[-1] - min(CORNER, steps[drawn[-1]] / 2), along[drawn[-1]]), (s[-1], last)]
+    at, h = np.array(knots).T
+    # Samples at knots within a segment; at vertices there are samples already.
+    more = np.setdiff1d(at, s)
+    where = np.searchsorted(s, more, side="right")
+    share = (more - s[where - 1]) / steps[where - 1]
+
+    def sampled(values: Float) -> Float:
+        inner = values[where - 1] + share * (values[where] - values[where - 1])
+        found: Float = np.insert(values, where, inner)
+        return found
+
+    s, x, y, times = (sampled(values) for values in (s, x, y, times))
+    return SampledCurve(s, x, y, np.interp(s, at, np.unwrap(h)), times)
 
 
 def _clothoid(curve: Clothoid, start: Place) -> SampledCurve:
@@ -551,13 +611,18 @@ def _clothoid(curve: Clothoid, start: Place) -> SampledCurve:
     times = None
     if curve.start_time is not None and curve.stop_time is not None:
         times = np.linspace(float(curve.start_time), float(curve.stop_time), count + 1)
-    return SampledCurve(s, x, y, heading(s), times, turns=True)
+    return SampledCurve(s, x, y, heading(s), times)
 
 
-def _spline(pieces: Sequence[ClothoidPiece], start: Place) -> SampledCurve:
+def _spline(
+    pieces: Sequence[ClothoidPiece], start: Place, resolve: Callable[[Any], Place]
+) -> SampledCurve:
     parts, time = list[SampledCurve](), 0.0
     timed = all(piece.end_time is not None for piece in pieces)
     for piece in pieces:
+        if piece.position is not None:
+            start = resolve(piece.position)
+        start = start._replace(h=start.h + float(piece.turn))
         length = float(piece.length)
         rate = (float(piece.end) - float(piece.start)) / length
         end = float(piece.end_time) if timed and piece.end_time is not None else 0.0
@@ -582,7 +647,7 @@ def _spline(pieces: Sequence[ClothoidPiece], start: Place) -> SampledCurve:
         [first.s, *(r.s[1:] + shift for r, shift in zip(rest, shifts[1:], strict=False))]
     )
     times = joined("times") if timed else None
-    return SampledCurve(s, joined("x"), joined("y"), joined("h"), times, turns=True)
+    return SampledCurve(s, joined("x"), joined("y"), joined("h"), times)
 
 
 def _nurbs(curve: Nurbs, places: list[Place]) -> SampledCurve:
@@ -605,7 +670,7 @@ def _nurbs(curve: Nurbs, places: list[Place]) -> SampledCurve:
     s = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
     h = np.unwrap(np.arctan2(np.gradient(y), np.gradient(x)))
     times = np.maximum.accumulate(found[:, 3] / found[:, 2]) if timed else None
-    return SampledCurve(s, x, y, h, times, turns=True)
+    return SampledCurve(s, x, y, h, times)
 
 
 def _de_boor(knots: Float, points: Float, degree: int, u: float) -> Float:

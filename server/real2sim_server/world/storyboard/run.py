@@ -499,7 +499,7 @@ def _nothing_yet(program: Program) -> ProgressState:
     board = program.board
     return ProgressState(
         (0,) * count, (0,) * count, {}, {}, {**board.parameters, **board.variables}, {}, {}, 1,
-        over=False, fresh=frozenset(),
+        over=False, fresh={},
     )  # fmt: skip
 
 

@@ -496,9 +496,9 @@ class PositionResolver:
     def _in_lane(
         self, road: str, lane: int, s: float, offset: float, orientation: Orientation | None
     ) -> Place:
-        t = self.network.middle(road, lane, s) + offset
-        place = self.network.place(road, s, t)
-        driving = place.h if self.network.drives_along(road, lane) else place.h + math.pi
+        place = self.network.place(road, s, self.network.middle(road, lane, s) + offset)
+        way = self.network.way(road, lane, s, along=self.network.drives_along(road, lane))
+        driving = way.path.nearest(place.x, place.y).yaw
         return place._replace(h=self._heading(orientation, driving))
 
     def _where(self, entity: str) -> tuple[RoadPoint, float]:

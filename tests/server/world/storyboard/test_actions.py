@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from .boards import action_at, board, drive, places, speeds
+from .boards import action_at, after, board, drive, event, places, speeds
 
 NEAR = 0.05
 """Trajectories meet their formulas within this [m]."""
@@ -124,6 +124,11 @@ def test_a_final_speed_is_that_of_the_arrival(run):
 
     assert places(worlds)[50, 0] == pytest.approx(140.0, abs=NEAR)
     assert speeds(worlds)[50] == pytest.approx(6.0, abs=0.05)
+    # One acceleration up to a speed, and its opposite from there.
+    rates = np.diff(speeds(worlds))[6:49] / 0.1
+    turn = int(np.argmax(np.sign(rates) != np.sign(rates[0])))
+    assert rates[: turn - 1] == pytest.approx(rates[0], abs=0.05)
+    assert rates[turn + 1 :] == pytest.approx(-rates[0], abs=0.05)
 
 
 def test_a_timed_polyline_is_met_at_its_times(run):
@@ -143,6 +148,66 @@ def test_a_timed_polyline_is_met_at_its_times(run):
     assert found[30, :2] == pytest.approx((45.0, 2.0), abs=NEAR)
     # At its end it goes on as it went.
     assert found[45, 0] == pytest.approx(50.0 + 5.0 * 0.5, abs=2 * NEAR)
+
+
+def polyline(*vertices, **options):
+    points = [
+        {"position": {"kind": "world", "x": x, "y": y, **more}, "oriented": bool(more), "time": t}
+        for t, x, y, more in vertices
+    ]
+    curve = {"shape": "polyline", "vertices": points}
+    return {"kind": "follow_trajectory", "curve": curve, **options}
+
+
+def test_a_timed_trajectory_begins_at_its_offset_and_its_time(run):
+    follow = polyline((0.0, 30.0, 20.0, {}), (10.0, 80.0, 20.0, {}), timing={}, offset=20.0)
+    worlds = run(action_at(1.0, follow), steps=30)
+
+    assert places(worlds)[11:31, 0] == pytest.approx(50.0 + 0.5 * np.arange(1, 21), abs=NEAR)
+
+
+def test_the_heading_turns_within_two_metres_of_a_vertex(run):
+    follow = polyline((0.0, 30.0, 20.0, {}), (0.0, 40.0, 20.0, {}), (0.0, 40.0, 40.0, {}))
+    worlds = run(action_at(1.0, follow), steps=38)
+
+    x, y, h = places(worlds)[11:].T
+    s = x - 30.0 + y - 20.0
+    turned = np.clip((s - 8.0) / 4.0, 0.0, 1.0)
+    assert h == pytest.approx(turned * math.pi / 2, abs=0.01)
+
+
+def test_headings_of_vertices_hold_up_to_the_next(run):
+    follow = polyline((0.0, 30.0, 20.0, {"h": 0.4}), (0.0, 50.0, 20.0, {"h": 0.4}))
+    worlds = run(action_at(1.0, follow), steps=25)
+
+    assert places(worlds)[11:25, 2] == pytest.approx(0.4)
+    assert places(worlds)[20, :2] == pytest.approx((40.0, 20.0), abs=NEAR)
+
+
+@pytest.mark.parametrize("given", [{}, {"h": math.pi}])
+def test_with_a_negative_speed_it_drives_along_a_trajectory_rear_first(run, given):
+    follow = polyline((0.0, 30.0, 20.0, given), (0.0, 60.0, 20.0, given))
+    back = {"kind": "speed", "speed": -5.0}
+    worlds = run(event("back", back, follow, start=after(1.0)), steps=60)
+
+    assert places(worlds)[11:61, 0] == pytest.approx(30.0 + 0.5 * np.arange(1, 51), abs=NEAR)
+    assert np.abs(places(worlds)[11:61, 2]) == pytest.approx(math.pi)
+
+
+def test_a_lane_offset_is_to_the_left_of_the_entity_that_it_refers_to(run):
+    oncoming = {"kind": "world", "x": 200.0, "y": 5.25, "h": math.pi}
+    init = [("other", {"kind": "teleport", "position": oncoming})]
+    aside = {"kind": "lane_offset", "offset": 4.0, "relative_to": "other"}
+    other = {"name": "other", "box": {"size": (4.6, 1.85, 1.5), "centre": (0.0, 0.0, 0.75)}}
+    storyboard = board(action_at(1.0, aside), init=init)
+    worlds = run(
+        stories=storyboard["stories"],
+        entities=[*storyboard["entities"], other],
+        init=init,
+        steps=20,
+    )
+
+    assert places(worlds)[20, 1] == pytest.approx(5.25 - 4.0)
 
 
 def test_a_clothoid_leads_where_its_integral_says(run):
@@ -194,6 +259,13 @@ def test_a_distance_to_the_ego_is_kept(run):
     rear = places(worlds)[-1, 0] - 2.3
     assert speeds(worlds)[-1] == pytest.approx(10.0, abs=0.1)
     assert rear - ego == pytest.approx(60.0, abs=0.2)
+
+
+def test_an_entity_that_is_there_is_not_added_again(run):
+    add = {"kind": "add_entity", "entity": "car", "position": {"kind": "world", "x": 0, "y": 0}}
+    worlds = run(action_at(1.0, add), steps=20)
+
+    assert places(worlds)[20, 0] == pytest.approx(places(worlds)[0, 0] + 20.0)
 
 
 def test_an_entity_appears_where_it_is_put_and_leaves(run):

@@ -147,6 +147,33 @@ def test_an_element_sets_off_another(run):
     assert times_of(worlds, "second") == pytest.approx([2.0], abs=SOON)
 
 
+def test_a_transition_sets_off_an_event_at_the_same_instant(run):
+    started = {
+        "kind": "element_state", "element_type": "act", "element": "act",
+        "state": "start_transition",
+    }  # fmt: skip
+    story = board(event("with_it", to_speed(12.0), start=condition(started), times=9))["stories"]
+    story[0]["acts"][0]["start"] = after(1.0)
+    worlds = run(stories=story)
+
+    assert times_of(worlds, "act") == times_of(worlds, "with_it") == pytest.approx([1.0])
+
+
+def test_a_delay_begins_anew_with_each_run_of_a_group(run):
+    ended = {
+        "kind": "element_state", "element_type": "event", "element": "first", "state": "complete",
+    }  # fmt: skip
+    story = board(
+        event("first", to_speed(12.0, 0.5), start=after(1.0)),
+        event("second", to_speed(10.0, 0.5), start=condition(ended, delay=1.0)),
+    )["stories"]
+    story[0]["acts"][0]["groups"][0]["times"] = 2
+    worlds = run(stories=story)
+
+    assert times_of(worlds, "first") == pytest.approx([1.0, 3.0], abs=3 * SOON)
+    assert times_of(worlds, "second") == pytest.approx([2.5, 4.5], abs=3 * SOON)
+
+
 @pytest.mark.parametrize(
     ("test", "at"),
     [
