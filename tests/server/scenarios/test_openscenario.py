@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from real2sim_proto.storyboard import Storyboard
 from real2sim_server.scenarios import ScenarioError
 from real2sim_server.scenarios.gallery import corner_case
 from real2sim_server.scenarios.openscenario import (
@@ -12,6 +13,7 @@ from real2sim_server.scenarios.openscenario import (
     read_openscenario_text,
     write_openscenario,
 )
+from tests.server.world.storyboard.boards import board, condition, event
 
 CASE = write_openscenario(corner_case("ccrb").storyboard()).decode()
 
@@ -146,3 +148,32 @@ def test_files_from_another_program_mean_the_same(tmp_path):
     assert change.actions[0].action.lane == -2
     assert change.actions[0].action.dynamics.shape == "sinusoidal"
     assert change.start.groups[0].conditions[0].test.value == 1.0
+
+
+def test_curves_and_clearances_are_read_back_as_written():
+    place = {"kind": "world", "x": 40.0, "y": 20.0, "h": 0.3}
+    lane = {"kind": "lane", "road": "1", "lane": -1, "s": 60.0}
+    vertices = [
+        {"position": place, "oriented": True},
+        {"position": {**place, "x": 60.0, "h": 0.0}},
+        {"position": {**lane, "orientation": {"h": 0.2, "relative": True}}, "oriented": True},
+        {"position": {**lane, "s": 80.0}},
+    ]
+    piece = {"start": 0.0, "end": 0.1, "length": 5.0}
+    pieces = [piece, {**piece, "turn": 0.2, "position": place}]
+    clear = {
+        "kind": "relative_clearance", "entities": ["car"], "ahead": 20.0, "behind": 5.0,
+        "lanes": [(-1, 1)], "others": ["Ego"], "freespace": True,
+    }  # fmt: skip
+    follow = [
+        {"kind": "follow_trajectory", "curve": {"shape": "polyline", "vertices": vertices}},
+        {"kind": "follow_trajectory", "curve": {"shape": "clothoid_spline", "pieces": pieces}},
+    ]
+    start = condition(clear, name="clear")
+    events = [event(f"follow_{k}", action, start=start) for k, action in enumerate(follow)]
+    fields = board(*events)
+    fields["entities"] = [{**e, "box": fields["entities"][1]["box"]} for e in fields["entities"]]
+    written = Storyboard.model_validate(fields)
+
+    again = read_openscenario_text(write_openscenario(written), "case.xosc").board
+    assert again.stories == written.stories
