@@ -149,7 +149,7 @@ class StandStill(Entities):
 
 
 class Offroad(Entities):
-    """Outside every lane for this duration [s]."""
+    """Outside every drivable lane for this duration [s]."""
 
     kind: Literal["offroad"] = "offroad"
     duration: Value

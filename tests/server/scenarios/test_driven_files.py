@@ -559,6 +559,15 @@ def test_a_time_gap_is_driven_by_who_follows(run):
     assert found.ego[-1].x - axle == pytest.approx(60.0 + 10.0 * (len(found.ego) - 1) * DT + 20.0)
 
 
+def test_an_action_beyond_the_performance_of_its_vehicle_is_noted(run):
+    steep = 'dynamicsShape="linear" dynamicsDimension="rate" value="12"'
+    noted = " ".join(run(scenario(action=speed(80.0, steep)), seconds=0.2).output.split())
+
+    assert "'Target' keeps its maxSpeed of 69 m/s, although actions ask for up to 80 m/s" in noted
+    assert "at most 10 m/s^2, although actions ask for up to 12 m/s^2" in noted
+    assert "keeps its" not in run(scenario(action=speed(60.0)), seconds=0.2).output
+
+
 @pytest.mark.parametrize(
     ("value", "limit", "seconds"),
     [(30.0, 'maxAcceleration="5"', 4.0), (0.0, 'maxDeceleration="2"', 5.0)],
@@ -675,6 +684,21 @@ def test_a_clearance_needs_a_lane_without_entities(run, lanes, opposite, begins)
     found = run(scenario(init=init, event_start=clear), seconds=2.0)
 
     assert found.begins("event") == pytest.approx(begins, abs=0.011)
+
+
+def test_off_the_road_is_outside_its_drivable_lanes(run, tmp_path):
+    (tmp_path / "verge.xodr").write_text(
+        ROAD.replace('id="-2" type="driving"', 'id="-2" type="none"')
+    )
+    off = """<StartTrigger><ConditionGroup><Condition name="off" delay="0" conditionEdge="none">
+    <ByEntityCondition><TriggeringEntities triggeringEntitiesRule="any">
+    <EntityRef entityRef="Ego"/></TriggeringEntities><EntityCondition>
+    <OffroadCondition duration="0.5"/></EntityCondition></ByEntityCondition></Condition>
+    </ConditionGroup></StartTrigger>"""
+    text, roads = scenario(event_start=off), ("--roads", str(tmp_path / "verge.xodr"))
+
+    assert run(text, *roads, seconds=1.0).begins("event") == pytest.approx([0.5], abs=0.011)
+    assert run(text, seconds=1.0).begins("event") == []
 
 
 def test_a_clothoid_spline_starts_where_its_pieces_say(run):

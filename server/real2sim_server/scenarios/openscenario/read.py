@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
 
-from real2sim_proto.storyboard import Storyboard
+from real2sim_proto.storyboard import Storyboard, resolved
+from real2sim_proto.storyboard_actions import SpeedAction
 
 from .. import ScenarioError
 from .elements import (
@@ -340,7 +341,50 @@ def _read(root: RawElement, file: str, folder: Path | None, options: ReadOptions
     _refuse_unread(root, file)
     for raw, name in reader.catalogs.used:
         _refuse_unread(raw, name)
-    return ScenarioFile(_validated(fields, file), reader.road_file, whole.notes.sentences())
+    board = _validated(fields, file)
+    notes = (*whole.notes.sentences(), *_beyond_performance(board))
+    return ScenarioFile(board, reader.road_file, notes)
+
+
+def _beyond_performance(board: Storyboard) -> Iterator[str]:
+    """Notes on entities whose actions ask for more than their performance allows."""
+    try:
+        board = resolved(board)
+    except ValueError:
+        return  # a value that only an episode has
+    given = [([entry.entity], entry.action) for entry in board.init]
+    given += [
+        (group.entities, action.action)
+        for story in board.stories
+        for act in story.acts
+        for group in act.groups
+        for maneuver in group.maneuvers
+        for event in maneuver.events
+        for action in event.actions
+    ]
+    speeds, rates = dict[str, float](), dict[str, float]()
+    for names, action in given:
+        if not isinstance(action, SpeedAction):
+            continue
+        dynamics = action.dynamics
+        for name in names:
+            if action.relative_to is None:
+                speeds[name] = max(speeds.get(name, 0.0), abs(float(action.speed)))
+            if dynamics.dimension == "rate" and dynamics.shape != "step":
+                rates[name] = max(rates.get(name, 0.0), abs(float(dynamics.value)))
+    for entity in board.entities:
+        name, fastest = entity.name, float(entity.max_speed)
+        if speeds.get(name, 0.0) > fastest:
+            yield (
+                f"{name!r} keeps its maxSpeed of {fastest:g} m/s, although actions ask for up to "
+                f"{speeds[name]:g} m/s"
+            )
+        most = max(float(entity.max_acceleration), float(entity.max_deceleration))
+        if rates.get(name, 0.0) > most:
+            yield (
+                f"{name!r} keeps its maxAcceleration and maxDeceleration of at most {most:g} "
+                f"m/s^2, although actions ask for up to {rates[name]:g} m/s^2"
+            )
 
 
 def _refuse_unread(root: RawElement, file: str) -> None:

@@ -684,7 +684,7 @@ def _standstill(test: StandStill, context: ConditionContext, since: Mapping[str,
 
 def _offroad(test: Offroad, context: ConditionContext, since: Mapping[str, float]) -> Outcome:
     network = context.view.network
-    return _lasting(test, context, since, lambda a: network.locate(a.x, a.y, a.h) is None)
+    return _lasting(test, context, since, lambda a: not network.is_drivable(a.x, a.y))
 
 
 def _end_of_road(test: EndOfRoad, context: ConditionContext, since: Mapping[str, float]) -> Outcome:

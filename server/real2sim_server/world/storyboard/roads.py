@@ -81,6 +81,9 @@ class RoadNetwork(Protocol):
     def locate(self, x: float, y: float, h: float) -> RoadPoint | None:
         """The road position of a place with a heading; None outside all lanes."""
 
+    def is_drivable(self, x: float, y: float) -> bool:
+        """Whether a place is on the surface of the road."""
+
     def onward(self, road: str, lane: int, s: float, ds: float) -> tuple[str, int, float, float]:
         """Road, lane and s at ``ds`` further along the reference line of a lane's road.
 
@@ -145,6 +148,9 @@ class RouteNetwork:
             return None
         lane = number if near.offset > 0 else -number
         return RoadPoint("route", lane, near.s - self._shift, near.offset, near.yaw)
+
+    def is_drivable(self, x: float, y: float) -> bool:  # noqa: D102
+        return self.locate(x, y, 0.0) is not None
 
     def onward(  # noqa: D102
         self, road: str, lane: int, s: float, ds: float
@@ -255,6 +261,9 @@ class GraphNetwork:
         road, lane = graph.road_places[near.lane_id]
         s, t = graph.road(road).project(x, y)
         return RoadPoint(road, lane, s, t, graph.road(road).at(s)[3])
+
+    def is_drivable(self, x: float, y: float) -> bool:  # noqa: D102
+        return bool(self.graph.is_drivable([[x, y]])[0])
 
     def onward(  # noqa: D102
         self, road: str, lane: int, s: float, ds: float
