@@ -358,7 +358,7 @@ class ClothoidPiece(Model):
     start: Value
     end: Value
     length: Value
-    end_time: Value | None = None
+    time: Value | None = Field(default=None, description="time at its start [s]")
     turn: Value = Field(default=0.0, description="turn at its start [rad]")
     position: Position | None = Field(
         default=None, description="its start; default: the end of the previous one"
@@ -373,6 +373,7 @@ class ClothoidSpline(Model):
         default=None, description="its start; default: where the entity is"
     )
     pieces: list[ClothoidPiece] = Field(min_length=1, max_length=1000)
+    end_time: Value | None = None
 
 
 Curve = Annotated[Polyline | Clothoid | ClothoidSpline | Nurbs, Field(discriminator="shape")]

@@ -103,16 +103,28 @@ def begun_alone(board: Storyboard, network: RoadNetwork | None = None) -> Storyb
             f"entity {of_scene.name!r} is the object {of_scene.object_id!r} of a scene; run the "
             "storyboard on that scene"
         )
+    ego_size = _ego_size(board)
+    return StoryboardRun.begin(
+        board,
+        {},
+        nobody_around(board),
+        ego_size=ego_size,
+        network=network or _straight_lanes(board),
+    )
+
+
+def _ego_size(board: Storyboard) -> tuple[float, float, float]:
     boxes = [e.box for e in resolved(board).entities if e.kind == "ego" and e.box is not None]
     length, width, height = (float(v) for v in (boxes[0].size if boxes else Scene.ego_size))
+    return length, width, height
+
+
+def nobody_around(board: Storyboard) -> Surroundings:
+    """The first instant of an ego that stands at the origin, without a scene."""
     route = straight(0.0, 0.0, 0.0)
-    ego = ObservedEgo.of(Motion(0.0, 0.0, 0.0), route.nearest(0.0, 0.0), (length, width, height))
+    ego = ObservedEgo.of(Motion(0.0, 0.0, 0.0), route.nearest(0.0, 0.0), _ego_size(board))
     ground = Ground(np.zeros(2), 1.0, np.zeros((2, 2), np.float32), np.ones((2, 2), np.bool_))
-    nobody = PackedTracks[ObjectState](()).at(0)
-    return StoryboardRun.begin(
-        board, {}, Surroundings(0, 0, 1, ego, nobody, route, ground),
-        ego_size=(length, width, height), network=network or _straight_lanes(board),
-    )  # fmt: skip
+    return Surroundings(0, 0, 1, ego, PackedTracks[ObjectState](()).at(0), route, ground)
 
 
 def _straight_lanes(board: Storyboard) -> RouteNetwork:

@@ -159,7 +159,7 @@ def test_curves_and_clearances_are_read_back_as_written():
         {"position": {**lane, "orientation": {"h": 0.2, "relative": True}}, "oriented": True},
         {"position": {**lane, "s": 80.0}},
     ]
-    piece = {"start": 0.0, "end": 0.1, "length": 5.0}
+    piece = {"start": 0.0, "end": 0.1, "length": 5.0, "time": 2.0}
     pieces = [piece, {**piece, "turn": 0.2, "position": place}]
     clear = {
         "kind": "relative_clearance", "entities": ["car"], "ahead": 20.0, "behind": 5.0,

@@ -179,7 +179,6 @@ class Positions:
         }
 
     def _spline(self, part: Part) -> Fields:
-        part.number_or_none("timeEnd")
         segments = part.children("ClothoidSplineSegment")
         starts = [s.find("PositionStart") for s in segments]
         if not segments:
@@ -187,14 +186,17 @@ class Positions:
         pieces = [
             {
                 "start": s.number("curvatureStart"), "end": s.number("curvatureEnd"),
-                "length": s.number("length"), "end_time": s.number_or_none("timeEnd"),
+                "length": s.number("length"), "time": s.number_or_none("timeStart"),
                 "turn": s.number("hOffset", 0.0),
                 "position": self.position(start) if start is not None and k else None,
             }
             for k, (s, start) in enumerate(zip(segments, starts, strict=True))
         ]  # fmt: skip
         position = None if starts[0] is None else self.position(starts[0])
-        return {"shape": "clothoid_spline", "position": position, "pieces": pieces}
+        return {
+            "shape": "clothoid_spline", "position": position, "pieces": pieces,
+            "end_time": part.number_or_none("timeEnd"),
+        }  # fmt: skip
 
     def _nurbs(self, part: Part) -> Fields:
         points = [

@@ -468,11 +468,11 @@ def _trajectory(parent: Element, curve: Mapping[str, Any], name: str, closed: bo
                     stopTime=curve["stop_time"])  # fmt: skip
         _position(_add(made, "Position"), curve["position"])
     elif kind == "clothoid_spline":
-        spline = _add(shape, "ClothoidSpline")
+        spline = _add(shape, "ClothoidSpline", timeEnd=curve["end_time"])
         for k, piece in enumerate(curve["pieces"]):
             made = _add(spline, "ClothoidSplineSegment", curvatureStart=piece["start"],
                         curvatureEnd=piece["end"], length=piece["length"],
-                        timeEnd=piece["end_time"], hOffset=piece["turn"])  # fmt: skip
+                        timeStart=piece["time"], hOffset=piece["turn"])  # fmt: skip
             position = piece["position"] if k else curve["position"]
             if position is not None:
                 _position(_add(made, "PositionStart"), position)

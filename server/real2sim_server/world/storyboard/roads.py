@@ -14,7 +14,6 @@ from real2sim_proto import ErrorCode
 from real2sim_proto.storyboard import RouteLanes
 from real2sim_proto.storyboard_actions import (
     Clothoid,
-    ClothoidPiece,
     ClothoidSpline,
     Curve,
     Nurbs,
@@ -537,7 +536,7 @@ def course_of(
                 "a clothoid spline has no start, and no entity follows it",
                 hint="give the `position` of its start",
             )
-        course = _spline(curve.pieces, start, resolve)
+        course = _spline(curve, start, resolve)
     else:
         course = _nurbs(curve, [resolve(p.position) for p in curve.points])
     if backwards and not isinstance(curve, Polyline):
@@ -623,28 +622,25 @@ def _clothoid(curve: Clothoid, start: Place) -> SampledCurve:
     return SampledCurve(s, x, y, heading(s), times)
 
 
-def _spline(
-    pieces: Sequence[ClothoidPiece], start: Place, resolve: Callable[[Any], Place]
-) -> SampledCurve:
-    parts, time = list[SampledCurve](), 0.0
-    timed = all(piece.end_time is not None for piece in pieces)
-    for piece in pieces:
+def _spline(curve: ClothoidSpline, start: Place, resolve: Callable[[Any], Place]) -> SampledCurve:
+    parts = list[SampledCurve]()
+    times = [*(piece.time for piece in curve.pieces), curve.end_time]
+    timed = None not in times
+    for piece, begin, end in zip(curve.pieces, times, times[1:], strict=False):
         if piece.position is not None:
             start = resolve(piece.position)
         start = start._replace(h=start.h + float(piece.turn))
         length = float(piece.length)
-        rate = (float(piece.end) - float(piece.start)) / length
-        end = float(piece.end_time) if timed and piece.end_time is not None else 0.0
         made = Clothoid(
             position=WorldPosition(x=0.0, y=0.0),
             curvature=piece.start,
-            curvature_rate=rate,
+            curvature_rate=(float(piece.end) - float(piece.start)) / length,
             length=length,
-            start_time=time if timed else None,
+            start_time=begin if timed else None,
             stop_time=end if timed else None,
         )
         parts.append(_clothoid(made, start))
-        start, time = parts[-1].at(length), end
+        start = parts[-1].at(length)
     shifts = np.concatenate([[0.0], np.cumsum([part.length for part in parts])])
     first, rest = parts[0], parts[1:]
 
@@ -655,8 +651,8 @@ def _spline(
     s = np.concatenate(
         [first.s, *(r.s[1:] + shift for r, shift in zip(rest, shifts[1:], strict=False))]
     )
-    times = joined("times") if timed else None
-    return SampledCurve(s, joined("x"), joined("y"), joined("h"), times)
+    at = joined("times") if timed else None
+    return SampledCurve(s, joined("x"), joined("y"), joined("h"), at)
 
 
 def _nurbs(curve: Nurbs, places: list[Place]) -> SampledCurve:
