@@ -191,6 +191,13 @@ def test_scenarios(page: Callable[[str], Page], demo: real2sim.Client) -> None:
         with demo.session("demo_street") as session:
             obs = session.reset(privileged=True, storyboard=storyboard)
             assert np.hypot(*obs.agents["lead"].velocity[:2]) == pytest.approx(6.0, abs=0.1)
+        board = scenarios.python("real2sim_proto.cases")["board"]
+        with demo.session("demo_street") as session:
+            obs = session.reset(privileged=True, storyboard=board)
+            assert np.hypot(*obs.agents["cutter"].velocity[:2]) == pytest.approx(12.0, abs=0.1)
+        own = demo.scenarios.create("demo_street")
+        own.set_storyboard(board)
+        assert own.storyboard == board
         unpack_street(scenarios.folder, "street.r2s")
         scenarios.shell("gallery:cut_in", {"scenes/street": "street.r2s"})
         assert frames_of(scenarios.folder / "cut_in.mp4") > 10

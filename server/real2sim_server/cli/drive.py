@@ -343,6 +343,8 @@ def gallery(
 
     A printed case is a storyboard in JSON, which `run` drives from a file.
     """
+    from real2sim._calls import sent_fields
+
     from ..scenarios.gallery import FAMILIES, GALLERY, corner_case
 
     if name is None:
@@ -362,11 +364,11 @@ def gallery(
     except ValueError as error:
         raise CommandError(str(error)) from error
     board = case.storyboard()
+    fields = sent_fields(board)
     if out is not None:
         _export(board, out)
     else:
-        typer.echo(board.model_dump_json(indent=2, exclude_unset=True))
-    fields = board.model_dump(mode="json", exclude_unset=True)
+        typer.echo(json_format.dumps(fields, indent=2))
     write_json(json, {**_case_fields(case), "storyboard": fields})
 
 

@@ -1,14 +1,17 @@
-"""Corner cases of the gallery: each runs on a plain scene as its formulas say, and as a file."""
+"""Corner cases, of the gallery and own ones: each runs as its formulas say, and as a file."""
 
 from __future__ import annotations
 
 import json
 import math
+import runpy
 
 import pytest
 from typer.testing import CliRunner
 
 from real2sim.cli import build_app
+from real2sim_proto import cases
+from real2sim_proto.cases import in_lane
 from real2sim_proto.episode import ResetSpec
 from real2sim_proto.storyboard import Storyboard
 from real2sim_server.edit import ScenarioState
@@ -16,8 +19,9 @@ from real2sim_server.scenarios.flat_scene import fitted_to_scene, flat_scene
 from real2sim_server.scenarios.gallery import GALLERY, corner_case
 from real2sim_server.scenarios.openscenario import read_openscenario_text, write_openscenario
 from real2sim_server.world import World
+from tests.pages import REPOSITORY
 
-from .definitions import DEFINITIONS, EGO_SPEED
+from .definitions import CAR_REAR, DEFINITIONS, EGO_FRONT, EGO_SPEED, LANE, along
 
 NEAR, SOON = 0.05, 0.05
 """How far from its formula [m, m/s], or how late [s], a case may be."""
@@ -131,6 +135,115 @@ def test_unknown_cases_and_parameters_are_refused_by_name():
         corner_case("gallery:cut_on")
     with pytest.raises(ValueError, match="no parameter 'gab'"):
         corner_case("cut_in").storyboard(gab=3.0)
+
+
+# --- Own cases ------------------------------------------------------------------------------------
+
+FROM, SPEED = 35.0, 7.0
+"""Where an own car starts in the lane on the left, and how fast."""
+
+CLOSING = (FROM - EGO_FRONT - CAR_REAR, EGO_SPEED - SPEED)
+"""Gap at the start [m], and how fast it closes [m/s]."""
+
+
+def own(*events):
+    return cases.case(cases.actor("car", in_lane(FROM, lane=1), SPEED, *events))
+
+
+@pytest.mark.parametrize(
+    ("start", "at"),
+    [
+        (None, 0.0),
+        (cases.at_time(2.0), 2.0),
+        (cases.gap_below("car", 20.0), (CLOSING[0] - 20.0) / CLOSING[1]),
+        (cases.time_gap_below("car", 2.5), (CLOSING[0] - 25.0) / CLOSING[1]),
+        (cases.ttc_below("car", 8.0), (CLOSING[0] - 24.0) / CLOSING[1]),
+        (cases.reached("car", in_lane(30.0, lane=1)), (FROM - 31.0) / CLOSING[1]),
+        (cases.driven("Ego", 15.0), 1.5),
+        (cases.driven("car", 14.0), 2.0),
+        ([cases.at_time(1.0), cases.driven("car", 14.0)], 2.0),
+    ],
+    ids=["none", "time", "gap", "time_gap", "ttc", "reached", "ego_driven", "driven", "both"],
+)
+def test_an_event_starts_at_its_closed_form_time(scene, start, at):
+    first = cases.event("first", start, cases.speed_to(SPEED - 1.0, seconds=0.5))
+    second = cases.event("second", cases.completed("first"), cases.speed_to(0.0))
+    found = starts(run(scene, own(first, second), at + 1.0))
+    assert found == pytest.approx({"first": at, "second": at + 0.5}, abs=SOON)
+
+
+SHIFT = math.pi * math.sqrt(0.5 / (2 * 0.8))
+"""Time to shift by 0.5 m with at most 0.8 m/s^2 [s]."""
+
+
+@pytest.mark.parametrize(
+    ("action", "x", "y", "speed"),
+    [
+        (cases.speed_to(11.0, rate=2.0), FROM + 7.0 + 18.0 + 11.0, LANE, 11.0),
+        (cases.speed_to(3.0, seconds=2.0), FROM + 7.0 + 10.0 + 3.0, LANE, 3.0),
+        (cases.speed_to(0.0), FROM + 7.0, LANE, 0.0),
+        (cases.change_lane(0, seconds=2.0), FROM + along(4.0, 1.0, 2.0, 7.0, LANE), 0.0, 7.0),
+        (cases.change_lane(0), FROM + along(4.0, 1.0, 3.0, 7.0, LANE), 0.0, 7.0),
+        (cases.change_lane(1, of="car", metres=10.0),
+         FROM + 7.0 + along(21.0, 0.0, 10.0, 1.0, LANE), 2 * LANE, 7.0),
+        (cases.shift(0.5), FROM + along(4.0, 1.0, SHIFT, 7.0, 0.5), LANE + 0.5, 7.0),
+        (cases.follow(cases.from_entity("car", 0.0), cases.from_entity("car", 40.0, -30.0)),
+         FROM + 7.0 + 0.8 * 21.0, LANE - 0.6 * 21.0, 7.0),
+        (cases.teleport(in_lane(50.0)), EGO_SPEED + 50.0 + 21.0, 0.0, 7.0),
+    ],
+    ids=["rate", "seconds", "stop", "lane", "3_s", "metres", "shift", "follow", "teleport"],
+)  # fmt: skip
+def test_an_action_moves_its_actor_by_its_formula(scene, action, x, y, speed):
+    worlds = run(scene, own(cases.event("move", cases.at_time(1.0), action)), 4.0)
+    car, origin = worlds[-1].storyboard.entities["car"], worlds[0].motion
+    found = (car.x - origin.x, car.y - origin.y, car.speed)
+    assert found == pytest.approx((x, y, speed), abs=NEAR)
+
+
+def test_a_hidden_actor_appears_and_vanishes(scene):
+    board = cases.case(
+        cases.actor(
+            "car", in_lane(FROM), SPEED,
+            cases.event("come", cases.at_time(1.0), cases.appear()),
+            cases.event("go", cases.at_time(2.0), cases.vanish()),
+            hidden=True,
+        )
+    )  # fmt: skip
+    worlds = run(scene, board, 2.5)
+    assert [worlds[k].storyboard.entities["car"].visible for k in (0, 8, 12, 18, 22)] == [
+        False, False, True, True, False,
+    ]  # fmt: skip
+
+
+def test_the_example_cuts_in_at_its_closed_form_time(scene):
+    """From 15 m behind, at 12 m/s, to within 1 m of 8 m ahead of an ego at 10 m/s."""
+    board = runpy.run_path(str(REPOSITORY / "examples/own_case.py"))["CASE"]
+    again = read_openscenario_text(write_openscenario(board), "own_case.xosc").board
+    assert again == board
+
+    worlds = run(scene, board, 16.0)
+    moves, stops = (15.0 + 8.0 - 1.0) / (12.0 - EGO_SPEED), 2.0
+    assert starts(worlds) == pytest.approx({"move_in": moves, "stop": moves + stops}, abs=SOON)
+    car, origin = worlds[-1].storyboard.entities["cutter"], worlds[0].motion
+    assert (car.y - origin.y, car.speed) == pytest.approx((0.0, 0.0), abs=NEAR)
+
+
+def test_an_own_case_of_every_part_survives_a_file(scene):
+    """Reading the file gives the same storyboard."""
+    parts = [
+        cases.event("a", cases.at_time("$start"), cases.speed_to(3.0, rate=2.0), cases.shift(0.2)),
+        cases.event("b", cases.gap_below("car", 5.0), cases.change_lane(0, metres=20.0)),
+        cases.event("c", cases.time_gap_below("car", 1.0), cases.teleport(in_lane(9.0, left=1.0))),
+        cases.event("d", cases.ttc_below("car", 1.0), cases.vanish()),
+        cases.event("e", cases.reached("car", cases.beside(9.0, -3.0)), cases.appear()),
+        cases.event("f", [cases.driven("car", 5.0), cases.completed("a")],
+                    cases.follow(in_lane(5.0), in_lane(9.0)), priority="parallel"),
+    ]  # fmt: skip
+    board = cases.case(
+        cases.actor("car", in_lane(FROM, lane=1, heading=math.pi), SPEED, *parts, hidden=True),
+        cases.ego(speed=9.0), name="own", parameters={"start": 1.0},
+    )  # fmt: skip
+    assert read_openscenario_text(write_openscenario(board), "own.xosc").board == board
 
 
 # --- real2sim gallery -----------------------------------------------------------------------------
