@@ -106,7 +106,7 @@ def _checked(what: str, given: Any) -> Any:
     models, example = _ALLOWED[what]
     if isinstance(given, models):
         return given
-    raise TypeError(f"{given!r} is no {what}; give one such as {example}")
+    raise TypeError(f"not a valid {what}: {given!r}; give one such as {example}")
 
 
 # --- Who takes part -------------------------------------------------------------------------------

@@ -116,12 +116,12 @@ def test_conditions_in_a_list_must_all_hold():
 @pytest.mark.parametrize(
     ("build", "error", "message"),
     [
-        (lambda: actor("x", 20.0), TypeError, "20.0 is no position; give one such as in_lane"),
+        (lambda: actor("x", 20.0), TypeError, "not a valid position: 20.0"),
         (lambda: actor("x", in_lane(2.0), body="vann"), ValueError, "'vann'; did you mean van"),
-        (lambda: actor("x", in_lane(2.0), 3.0, at_time(1.0)), TypeError, "is no event"),
-        (lambda: event("x", 2.0, speed_to(0.0)), TypeError, "2.0 is no condition; give one such"),
-        (lambda: event("x", speed_to(0.0), at_time(2.0)), TypeError, "is no condition"),
-        (lambda: event("x", None, at_time(2.0)), TypeError, "is no action"),
+        (lambda: actor("x", in_lane(2.0), 3.0, at_time(1.0)), TypeError, "not a valid event"),
+        (lambda: event("x", 2.0, speed_to(0.0)), TypeError, "not a valid condition: 2.0"),
+        (lambda: event("x", speed_to(0.0), at_time(2.0)), TypeError, "not a valid condition"),
+        (lambda: event("x", None, at_time(2.0)), TypeError, "not a valid action"),
         (lambda: speed_to(1.0, rate=2.0, seconds=3.0), ValueError, "rate=2.0 and seconds=3.0"),
         (lambda: change_lane(0, seconds=1.0, metres=2.0), ValueError, "give one of them"),
         (lambda: follow(in_lane(2.0)), ValueError, "1 positions; give at least 2"),

@@ -352,7 +352,7 @@ def _beyond_performance(board: Storyboard) -> Iterator[str]:
         board = resolved(board)
     except ValueError:
         return  # a value that only an episode has
-    given = [([entry.entity], entry.action) for entry in board.init]
+    given: list[tuple[list[str], Any]] = [([e.entity], e.action) for e in board.init]
     given += [
         (group.entities, action.action)
         for story in board.stories
