@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from real2sim_proto import ErrorCode
@@ -96,7 +96,7 @@ def _freed(actor: EntityState) -> EntityState:
         return actor
     course = actor.trajectory.course
     places = [Place(float(x), float(y), 0.0) for x, y in zip(course.x, course.y, strict=True)]
-    if course.sense(actor.trajectory.s) < 0.0:
+    if actor.trajectory.sense < 0.0:
         places.reverse()
     way = Way("trajectory", 1, True, path_through(places))
     return copy_with(actor, trajectory=None).on_way(way)
@@ -290,10 +290,10 @@ def _follow_trajectory(
     elapsed = 0.0
     if timing is not None and timing.domain == "absolute":
         elapsed = at.view.elapsed
-    elif timing is not None and s > 0.0:
+    elif timing is not None and s > 0.0 and float(timing.scale) > 0.0:
         # It starts at the time of its offset.
         elapsed = (course.time_at(s) - float(timing.offset)) / float(timing.scale)
-    following = Trajectory(at.token, course, timing, s, elapsed)
+    following = Trajectory(at.token, course, timing, s, elapsed, course.sense(s))
     longitudinal = actor.longitudinal if timing is None else None
     actor = copy_with(
         actor, trajectory=following, lateral=None, longitudinal=longitudinal, drift=0.0
@@ -302,7 +302,7 @@ def _follow_trajectory(
         return actor
     if timing is not None:
         time = elapsed * float(timing.scale) + float(timing.offset)
-        following = Trajectory(at.token, course, timing, course.distance_at(time), elapsed)
+        following = replace(following, s=course.distance_at(time))
         actor = copy_with(actor, trajectory=following)
     place = following.place()
     return copy_with(actor, x=place.x, y=place.y, h=place.h)

@@ -560,10 +560,12 @@ def _on_trajectory(actor: EntityState, view: View, way: float, h: float) -> Enti
         return copy_with(
             actor, trajectory=then, x=place.x, y=place.y, h=place.h, travelled=travelled, drift=0.0
         )
-    past = before.s + before.course.sense(before.s) * way
-    last = 0.0 if past <= 0.0 else before.course.length
+    last, beyond = before.course.length, 0.0
+    if before.timing is None:
+        past = before.s + before.sense * way
+        last = 0.0 if past <= 0.0 else last
+        beyond = math.copysign(abs(past - last), way)
     end = before.course.at(last)
-    beyond = math.copysign(abs(past - last), way) if before.timing is None else 0.0
     done = copy_with(actor, finished=actor.finished | {before.token}, travelled=travelled)
     put = done.put(end, view.network)
     return copy_with(put, s=put.s + beyond).placed() if put.way is not None and beyond else put

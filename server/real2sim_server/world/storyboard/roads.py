@@ -465,6 +465,7 @@ class Trajectory:
         timing: interpretation of the curve's times; None for the entity's own speed.
         s: distance along the curve [m].
         elapsed: time since the start of the action, or of the simulation [s].
+        sense: 1 if it began facing along the curve, -1 if against it.
     """
 
     token: int
@@ -472,27 +473,28 @@ class Trajectory:
     timing: Timing | None
     s: float
     elapsed: float
+    sense: float
 
     def ahead(self, x: float, y: float) -> float:
         """Distance ahead of the entity to a place along the curve [m]."""
-        return self.course.sense(self.s) * (self.course.nearest(x, y) - self.s)
+        return self.sense * (self.course.nearest(x, y) - self.s)
 
     def step(self, way: float, h: float) -> tuple[float, Trajectory | None]:
         """Distance covered in ``h`` seconds, by its times or as given, and the new state.
 
         The state is None at the end of the curve, or at its start if the entity moves back.
         """
-        sense = self.course.sense(self.s)
         if self.timing is None:
-            s = self.s + sense * way
-            over = s >= self.course.length - 1e-9 or (s <= 0.0 and sense * way < 0.0)
+            s = self.s + self.sense * way
+            over = s >= self.course.length - 1e-9 or (s <= 0.0 and self.sense * way < 0.0)
             return way, None if over else replace(self, s=s)
         elapsed = self.elapsed + h
         time = elapsed * float(self.timing.scale) + float(self.timing.offset)
         s = self.course.distance_at(time)
         assert self.course.times is not None
         over = time >= self.course.times[-1] - 1e-9
-        return sense * (s - self.s), None if over else replace(self, s=s, elapsed=elapsed)
+        covered = self.course.sense(self.s) * (s - self.s)
+        return covered, None if over else replace(self, s=s, elapsed=elapsed)
 
     def begun(self) -> bool:
         """Whether its first time has been reached."""

@@ -194,6 +194,14 @@ def test_with_a_negative_speed_it_drives_along_a_trajectory_rear_first(run, give
     assert np.abs(places(worlds)[11:61, 2]) == pytest.approx(math.pi)
 
 
+def test_it_goes_on_along_a_trajectory_whose_vertices_turn_it_around(run):
+    vertices = [(0.0, 30.0, 20.0, {"h": 0.0}), (0.0, 45.0, 20.0, {"h": math.pi})]
+    follow = polyline(*vertices, (0.0, 70.0, 20.0, {"h": math.pi}))
+    worlds = run(action_at(1.0, follow), steps=45)
+
+    assert places(worlds)[11:45, 0] == pytest.approx(30.0 + np.arange(1, 35), abs=NEAR)
+
+
 def test_a_lane_offset_is_to_the_left_of_the_entity_that_it_refers_to(run):
     oncoming = {"kind": "world", "x": 200.0, "y": 5.25, "h": math.pi}
     init = [("other", {"kind": "teleport", "position": oncoming})]
