@@ -21,7 +21,7 @@ from real2sim_server.sweeps.spec import open_scene, run_options
 past = reached("cutter", in_lane(8.0, lane=1))
 move_in = event("move_in", past, change_lane(0, seconds=2.0))
 stop = event("stop", completed("move_in"), speed_to(0.0, rate=6.0))
-CASE = case(actor("cutter", in_lane(-15.0, lane=1), 12.0, move_in, stop), name="Own cut-in")
+CASE = case(actor("cutter", in_lane(-15.0, lane=1), 12.0, move_in, stop), name="My cut-in")
 
 
 def main() -> None:
@@ -30,7 +30,7 @@ def main() -> None:
     driven = drive_episode(open_scene("demo_street"), drive, load_planner("idm"))
     if driven.world is None:
         raise SystemExit(driven.error)
-    print(f"Own cut-in: {driven.world.reason}, smallest gap {driven.danger.gap:.1f} m")
+    print(f"My cut-in: {driven.world.reason}, smallest gap {driven.danger.gap:.1f} m")
     Path("own_case.xosc").write_bytes(write_openscenario(CASE))
 
 

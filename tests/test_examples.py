@@ -21,7 +21,7 @@ EXAMPLES = {
     "own_log": ("objects: ['car_0']", "my_scene/scene.json"),
     "cut_in": ("Idm: ", None),
     "crash": ("car_6 hits ", "crash.webm"),
-    "own_case": ("Own cut-in: ", "own_case.xosc"),
+    "own_case": ("My cut-in: ", "own_case.xosc"),
     "own_planner": ("route_progress", None),
     "dataset": ("boxes", "dataset"),
     "train_policy": ("round 5: ", None),

@@ -1,4 +1,4 @@
-"""Build storyboards in a few lines: road users around the ego, and events that move them.
+"""Build storyboards in a few lines: road users around the ego, and the events that move them.
 
 ::
 
@@ -109,7 +109,7 @@ def _checked(what: str, given: Any) -> Any:
     raise TypeError(f"not a valid {what}: {given!r}; give one such as {example}")
 
 
-# --- Who takes part -------------------------------------------------------------------------------
+# --- Actors ---------------------------------------------------------------------------------------
 
 BODIES: dict[str, tuple[str, float, tuple[float, float, float], float]] = {
     "car": ("car", 1500.0, (4.5, 1.85, 1.5), 1.35),
@@ -136,7 +136,7 @@ def actor(
         speed: initial speed [m/s].
         events: see :func:`event`.
         body: one of ``BODIES``.
-        hidden: not in the world until it does :func:`appear`.
+        hidden: whether it starts outside the world; :func:`appear` brings it in.
         fields: other fields of its ``Entity``, such as ``asset_id``, ``box`` or ``max_speed``.
 
     Raises:
@@ -156,7 +156,7 @@ def actor(
 
 
 def ego(at: Position | None = None, speed: Value | None = None) -> Actor:
-    """The ego; ``at`` is relative to its start in the scene, None leaves place or speed [m/s]."""
+    """The ego; ``at`` is relative to its start in the scene. None keeps the place or the speed."""
     box = BoundingBox(size=(4.6, 1.85, 1.6), centre=(1.35, 0.0, 0.8))
     init: list[Any] = [] if at is None else [teleport(at)]
     init += [] if speed is None else [speed_to(speed)]
@@ -166,7 +166,7 @@ def ego(at: Position | None = None, speed: Value | None = None) -> Actor:
 
 # --- Positions ------------------------------------------------------------------------------------
 
-# Relative to the ego's start for actors, and to where the ego is by then in events.
+# Relative to the ego: to its start for actors, and to where it is at that time in events.
 
 
 def in_lane(
@@ -219,7 +219,7 @@ def event(
             ``skip`` does not start while one runs.
 
     Raises:
-        TypeError: something else than a condition or an action.
+        TypeError: anything but conditions and actions.
     """
     if not (start is None or isinstance(start, Trigger)):
         tests = start if isinstance(start, list | tuple) else [start]
@@ -340,5 +340,5 @@ def appear() -> actions.VisibilityAction:
 
 
 def vanish() -> actions.VisibilityAction:
-    """Leave the world, until it does :func:`appear`."""
+    """Leave the world; :func:`appear` brings it back."""
     return actions.VisibilityAction(visible=False)

@@ -382,6 +382,17 @@ def element_names(board: Storyboard) -> Iterator[tuple[str, ...]]:
                             yield (*at, maneuver.name, event.name, action.name)
 
 
+def story_actions(board: Storyboard) -> Iterator[tuple[list[str], Any]]:
+    """Names of the entities, and the action, of each action of the stories."""
+    for story in board.stories:
+        for act in story.acts:
+            for group in act.groups:
+                for maneuver in group.maneuvers:
+                    for event in maneuver.events:
+                        for each in event.actions:
+                            yield list(map(str, group.entities)), each.action
+
+
 def _plain(value: Any) -> Any:
     if isinstance(value, Model):
         return value.model_dump()
@@ -496,4 +507,5 @@ __all__ = [
     "element_names",
     "entity_references",
     "resolved",
+    "story_actions",
 ]

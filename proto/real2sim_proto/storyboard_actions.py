@@ -301,7 +301,7 @@ class Vertex(Model):
     position: Position
     oriented: bool = Field(
         default=False,
-        description="whether the position gives the heading from here on; else it is the line's",
+        description="use the heading of the position from here on; else that of the line",
     )
 
 
@@ -359,19 +359,19 @@ class ClothoidPiece(Model):
     end: Value
     length: Value
     time: Value | None = Field(default=None, description="time at its start [s]")
-    turn: Value = Field(default=0.0, description="turn at its start [rad]")
+    turn: Value = Field(default=0.0, description="change of heading at its start [rad]")
     position: Position | None = Field(
-        default=None, description="its start; default: the end of the previous one"
+        default=None, description="its start; default: the end of the previous segment"
     )
 
 
 class ClothoidSpline(Model):
-    """Clothoid segments, each continuing the previous one unless it has a position of its own."""
+    """Clothoid segments, each continuing the previous one unless it has a position of its own.
+
+    Without a position, the first one starts where the entity is.
+    """
 
     shape: Literal["clothoid_spline"] = "clothoid_spline"
-    position: Position | None = Field(
-        default=None, description="its start; default: where the entity is"
-    )
     pieces: list[ClothoidPiece] = Field(min_length=1, max_length=1000)
     end_time: Value | None = None
 

@@ -79,7 +79,7 @@ class Distance(Entities, Distances):
 
 
 class RelativeClearance(Entities):
-    """A lane beside the own one, or the own one, exists and has no entity near along the road."""
+    """One of the given lanes exists, and no other entity is near in any of them."""
 
     kind: Literal["relative_clearance"] = "relative_clearance"
     ahead: Value = Field(default=0.0, description="distance ahead that must be clear [m]")
@@ -87,13 +87,13 @@ class RelativeClearance(Entities):
     lanes: list[tuple[int, int]] = Field(
         default_factory=list,
         max_length=64,
-        description="ranges of lanes, positive to the left, 0 the own one; empty: all",
+        description="ranges relative to the entity's lane, positive to the left; empty: all",
     )
-    opposite: bool = Field(default=False, description="also lanes of the other direction")
+    opposite: bool = Field(default=False, description="also lanes in the opposite direction")
     others: list[Reference] = Field(
-        default_factory=list, max_length=64, description="entities; empty: all others"
+        default_factory=list, max_length=64, description="entities to check; empty: all others"
     )
-    freespace: bool = Field(default=False, description="from box to box")
+    freespace: bool = Field(default=False, description="measure between the boxes")
 
 
 class ReachPosition(Entities):

@@ -148,18 +148,14 @@ def run(
 
 def _ego_actions(board: Storyboard) -> int:
     """Number of actions of the stories that move the ego."""
+    from real2sim_proto.storyboard import story_actions
+
     from ..world.storyboard.progress import GLOBAL
 
     egos = {entity.name for entity in board.entities if entity.kind == "ego"}
     return sum(
-        not isinstance(action.action, GLOBAL)
-        for story in board.stories
-        for act in story.acts
-        for group in act.groups
-        if egos & set(map(str, group.entities))
-        for maneuver in group.maneuvers
-        for event in maneuver.events
-        for action in event.actions
+        not isinstance(action, GLOBAL) and not egos.isdisjoint(names)
+        for names, action in story_actions(board)
     )
 
 

@@ -72,7 +72,7 @@ def damage_named(where: str) -> Iterator[None]:
 
 
 def notes_of(left_out: Mapping[str, Iterable[str]]) -> tuple[str, ...]:
-    """Notes on names by kind: one sentence a kind, with the number of names and the first five."""
+    """Notes on names by kind: a sentence for each, with the number of names and the first five."""
     notes = []
     for kind, given in left_out.items():
         if not (names := list(dict.fromkeys(given))):
@@ -193,11 +193,11 @@ def integer(element: ET.Element, name: str, where: str) -> int:
 STEP_M = 1.0
 SAME_PLACE_M = 1e-3
 FIT_M = 0.03
-"""Accepted distance between the borders of a lane and the given ones."""
+"""Accepted distance between the borders of a lane and the given ones [m]."""
 CORNER = math.radians(3.0)
-"""Smaller turns of a centre line are not kept exactly."""
+"""Minimum turn of a centre line that is kept exactly [rad]."""
 MAX_COMPARED = 2_000_000
-"""Points times segments of a lane whose nearest points are looked for, which takes a second."""
+"""Maximum number of pairs of a point and a segment that are compared for a lane: about a second."""
 
 
 def between(left: Float, right: Float) -> tuple[Float, Float] | None:
@@ -244,7 +244,7 @@ def _at(line: Float, s: Float, known: Float | None = None) -> Float:
 
 
 def _apart(line: Float) -> Any:
-    """Which points of a line are not at the place of the one before."""
+    """Which points of a line differ from the one before."""
     steps = np.linalg.norm(np.diff(line[:, :2], axis=0), axis=1)
     return np.concatenate([[True], steps > SAME_PLACE_M])
 
@@ -252,8 +252,8 @@ def _apart(line: Float) -> Any:
 def _paired(left: Float, right: Float) -> tuple[Float, Float] | None:
     """Centre line and widths from pairs of nearest points of both borders.
 
-    A corner has points on both sides at one distance, that of the feet of its inner border. It has
-    then the mean of both directions, and the corners of both borders stay where they are.
+    On both sides of a corner there is a point as far away as the foot of its inner border. So the
+    corner has the mean of both directions, and the corners of both borders stay in place.
     """
     pairs = [np.zeros(2), np.array([_along(left)[-1], _along(right)[-1]])]
     for rim, other, order in ((left, right, 1), (right, left, -1)):

@@ -26,7 +26,7 @@ from .failure import Failure, boundaries, render_page, write_scenario
 from .optimise import SearchBudget, SearchState, search
 from .parameters import drawn_parameters
 from .spec import Space, open_scene
-from .sweep import Journal
+from .sweep import open_journal
 
 # --- Statistics ----------------------------------------------------------------------------------
 
@@ -215,10 +215,7 @@ def run_search(
     options = options or SearchOptions()
     scene = _scene_of(spaces, options.scenes)
     _check_planner(planner, scene)
-    try:
-        journal = Journal(out / JOURNAL)
-    except ValueError as error:
-        raise CommandError(str(error)) from error
+    journal = open_journal(out / JOURNAL)
     known = len(journal.rows)
     with journal:
         evaluate = Evaluator(scene, spaces, planner, journal=journal)

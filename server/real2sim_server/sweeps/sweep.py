@@ -112,6 +112,14 @@ class Journal:
         return end
 
 
+def open_journal(path: Path) -> Journal:
+    """The journal of a sweep or a search. Raises CommandError for a file of another kind."""
+    try:
+        return Journal(path)
+    except ValueError as error:
+        raise CommandError(str(error)) from error
+
+
 def _row(line: bytes) -> tuple[str, dict[str, Any]] | None:
     checksum, _, text = line.rstrip(b"\n").partition(b" ")
     try:
@@ -329,10 +337,7 @@ def run_sweep(
     _check(spec, scene)
     planned = planned_episodes(spec, scene.content_hash or "")
     recipe = recipe_of(spec.case.scene, scenes, spec.metrics)
-    try:
-        journal = Journal(out / JOURNAL)
-    except ValueError as error:
-        raise CommandError(str(error)) from error
+    journal = open_journal(out / JOURNAL)
     known = len(journal.rows)
     with journal:
         for part in _parts(planned, spec.stop):

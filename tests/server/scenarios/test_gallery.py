@@ -137,10 +137,10 @@ def test_unknown_cases_and_parameters_are_refused_by_name():
         corner_case("cut_in").storyboard(gab=3.0)
 
 
-# --- Own cases ------------------------------------------------------------------------------------
+# --- Your own cases -------------------------------------------------------------------------------
 
 FROM, SPEED = 35.0, 7.0
-"""Where an own car starts in the lane on the left, and how fast."""
+"""Where a car starts in the lane on the left, and how fast."""
 
 CLOSING = (FROM - EGO_FRONT - CAR_REAR, EGO_SPEED - SPEED)
 """Gap at the start [m], and how fast it closes [m/s]."""

@@ -180,7 +180,6 @@ class Positions:
 
     def _spline(self, part: Part) -> Fields:
         segments = part.children("ClothoidSplineSegment")
-        starts = [s.find("PositionStart") for s in segments]
         if not segments:
             raise part.error("<ClothoidSpline> has no <ClothoidSplineSegment>")
         pieces = [
@@ -188,15 +187,12 @@ class Positions:
                 "start": s.number("curvatureStart"), "end": s.number("curvatureEnd"),
                 "length": s.number("length"), "time": s.number_or_none("timeStart"),
                 "turn": s.number("hOffset", 0.0),
-                "position": self.position(start) if start is not None and k else None,
+                "position": None if start is None else self.position(start),
             }
-            for k, (s, start) in enumerate(zip(segments, starts, strict=True))
+            for s, start in ((s, s.find("PositionStart")) for s in segments)
         ]  # fmt: skip
-        position = None if starts[0] is None else self.position(starts[0])
-        return {
-            "shape": "clothoid_spline", "position": position, "pieces": pieces,
-            "end_time": part.number_or_none("timeEnd"),
-        }  # fmt: skip
+        end_time = part.number_or_none("timeEnd")
+        return {"shape": "clothoid_spline", "pieces": pieces, "end_time": end_time}
 
     def _nurbs(self, part: Part) -> Fields:
         points = [

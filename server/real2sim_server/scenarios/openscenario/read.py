@@ -11,7 +11,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from real2sim_proto.storyboard import Storyboard, resolved
+from real2sim_proto.storyboard import Storyboard, resolved, story_actions
 from real2sim_proto.storyboard_actions import SpeedAction
 
 from .. import ScenarioError
@@ -352,18 +352,9 @@ def _beyond_performance(board: Storyboard) -> Iterator[str]:
         board = resolved(board)
     except ValueError:
         return  # a value that only an episode has
-    given: list[tuple[list[str], Any]] = [([e.entity], e.action) for e in board.init]
-    given += [
-        (group.entities, action.action)
-        for story in board.stories
-        for act in story.acts
-        for group in act.groups
-        for maneuver in group.maneuvers
-        for event in maneuver.events
-        for action in event.actions
-    ]
+    init = (([entry.entity], entry.action) for entry in board.init)
     speeds, rates = dict[str, float](), dict[str, float]()
-    for names, action in given:
+    for names, action in itertools.chain(init, story_actions(board)):
         if not isinstance(action, SpeedAction):
             continue
         dynamics = action.dynamics

@@ -469,13 +469,12 @@ def _trajectory(parent: Element, curve: Mapping[str, Any], name: str, closed: bo
         _position(_add(made, "Position"), curve["position"])
     elif kind == "clothoid_spline":
         spline = _add(shape, "ClothoidSpline", timeEnd=curve["end_time"])
-        for k, piece in enumerate(curve["pieces"]):
+        for piece in curve["pieces"]:
             made = _add(spline, "ClothoidSplineSegment", curvatureStart=piece["start"],
                         curvatureEnd=piece["end"], length=piece["length"],
                         timeStart=piece["time"], hOffset=piece["turn"])  # fmt: skip
-            position = piece["position"] if k else curve["position"]
-            if position is not None:
-                _position(_add(made, "PositionStart"), position)
+            if piece["position"] is not None:
+                _position(_add(made, "PositionStart"), piece["position"])
     else:
         made = _add(shape, "Nurbs", order=curve["order"])
         for point in curve["points"]:

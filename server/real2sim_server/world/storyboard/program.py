@@ -493,7 +493,7 @@ def _relative_distance(
 
 
 MAX_LANES = 20
-"""Lanes beside the own one that a clearance condition looks at."""
+"""Maximum number of lanes to either side of an entity that a clearance condition checks."""
 
 
 def _clearance(
@@ -501,29 +501,29 @@ def _clearance(
 ) -> Outcome:
     view = context.view
 
+    def counts(lanes: int) -> bool:
+        return not test.lanes or any(low <= lanes <= high for low, high in test.lanes)
+
     def exists(actor: EntityState) -> bool:
-        """Whether a lane of the ranges is there, in a direction that counts."""
+        """Whether one of the lanes exists in a permitted direction."""
         here = view.network.locate(actor.x, actor.y, actor.h)
         if here is None:
             return False
         sense = 1 if math.cos(actor.h - here.h) >= 0.0 else -1
-        for lanes in range(-MAX_LANES, MAX_LANES + 1) if test.lanes else ():
-            if not any(low <= lanes <= high for low, high in test.lanes):
-                continue
+        for lanes in filter(counts, range(-MAX_LANES, MAX_LANES + 1)):
             try:
                 lane = view.network.neighbour(here.road, here.lane, here.s, sense * lanes)
             except WorldError:
                 continue
             if test.opposite or (lane < 0) == (here.lane < 0):
                 return True
-        return not test.lanes
+        return False
 
     def near(actor: EntityState, other: EntityState) -> bool:
-        lanes, ahead = _apart_on_road(actor, other, view)
-        if lanes is None:
+        apart = _apart_on_road(actor, other, view)
+        if apart is None or not counts(apart[0]):
             return False
-        if test.lanes and not any(low <= lanes <= high for low, high in test.lanes):
-            return False
+        ahead = apart[1]
         if not test.opposite and math.cos(actor.h - other.h) < 0.0:
             return False
         front = back = 0.0
@@ -540,23 +540,23 @@ def _clearance(
     return _of_entities(test, context, since, holds)
 
 
-def _apart_on_road(actor: EntityState, other: EntityState, view: View) -> tuple[int | None, float]:
-    """Lanes of another entity to the left of an entity, and its distance ahead [m].
+def _apart_on_road(actor: EntityState, other: EntityState, view: View) -> tuple[int, float] | None:
+    """Number of lanes to the left of an entity, and distance ahead [m], of another one.
 
-    The number is None where the road does not lead from one to the other.
+    None if the road does not lead from one to the other.
     """
     network = view.network
     here = network.locate(actor.x, actor.y, actor.h)
     there = network.locate(other.x, other.y, other.h)
     ahead = along(actor.h, other.x - actor.x, other.y - actor.y)
     if here is None or there is None:
-        return None, ahead
+        return None
     sense = 1.0 if math.cos(actor.h - here.h) >= 0.0 else -1.0
     if here.road == there.road:
         return int(sense) * lanes_between(here.lane, there.lane), sense * (there.s - here.s)
     road, lane, s, onward = network.onward(here.road, here.lane, here.s, sense * ahead)
     if road != there.road:
-        return None, ahead
+        return None
     sense *= onward
     return int(sense) * lanes_between(lane, there.lane), ahead + sense * (there.s - s)
 

@@ -75,7 +75,8 @@ class ProgressState(NamedTuple):
         signal_starts, signal_states: traffic signal settings made by actions.
         token: token of the next action.
         over: whether the storyboard has been stopped.
-        fresh: element transitions of the last instant, and the element evaluated at that time.
+        fresh: transitions of the last instant, each with the number of the element whose trigger
+            was being evaluated.
     """
 
     status: tuple[int, ...]
@@ -272,7 +273,7 @@ class Progress:
                 self._forget_conditions(element)
 
     def _forget_conditions(self, element: Element) -> None:
-        """Let the edges and delays of an element that may start again begin anew."""
+        """Reset the edges and delays of an element that may start again."""
         for row in element.start.numbers if element.start is not None else ():
             for number in row:
                 self._conditions.pop(number, None)

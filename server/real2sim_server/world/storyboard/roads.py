@@ -520,7 +520,7 @@ def course_of(
     Args:
         curve: the curve.
         resolve: turns its positions into places.
-        here: place of the entity, where splines without a position start.
+        here: place of the entity, where a spline without a position starts.
         backwards: whether the entity faces against the curve, except where vertices give headings.
 
     Raises:
@@ -531,14 +531,7 @@ def course_of(
     elif isinstance(curve, Clothoid):
         course = _clothoid(curve, resolve(curve.position))
     elif isinstance(curve, ClothoidSpline):
-        start = here if curve.position is None else resolve(curve.position)
-        if start is None:
-            raise WorldError(
-                ErrorCode.INVALID_REQUEST,
-                "a clothoid spline has no start, and no entity follows it",
-                hint="give the `position` of its start",
-            )
-        course = _spline(curve, start, resolve)
+        course = _spline(curve, here, resolve)
     else:
         course = _nurbs(curve, [resolve(p.position) for p in curve.points])
     if backwards and not isinstance(curve, Polyline):
@@ -624,13 +617,21 @@ def _clothoid(curve: Clothoid, start: Place) -> SampledCurve:
     return SampledCurve(s, x, y, heading(s), times)
 
 
-def _spline(curve: ClothoidSpline, start: Place, resolve: Callable[[Any], Place]) -> SampledCurve:
+def _spline(
+    curve: ClothoidSpline, start: Place | None, resolve: Callable[[Any], Place]
+) -> SampledCurve:
     parts = list[SampledCurve]()
     times = [*(piece.time for piece in curve.pieces), curve.end_time]
     timed = None not in times
     for piece, begin, end in zip(curve.pieces, times, times[1:], strict=False):
         if piece.position is not None:
             start = resolve(piece.position)
+        if start is None:
+            raise WorldError(
+                ErrorCode.INVALID_REQUEST,
+                "a clothoid spline has no start, and no entity follows it",
+                hint="give the `position` of its first piece",
+            )
         start = start._replace(h=start.h + float(piece.turn))
         length = float(piece.length)
         made = Clothoid(
