@@ -319,8 +319,8 @@ class Lane:
 
     @property
     def turn(self) -> float:
-        """Absolute change of direction from start to end [rad]."""
-        return abs(float(self.headings[-1] - self.headings[0]))
+        """Change of direction from start to end, positive left [rad]."""
+        return float(self.headings[-1] - self.headings[0])
 
     @cached_property
     def rims(self) -> tuple[Float, Float]:

@@ -380,6 +380,17 @@ class LaneGraph:
                 found[name].append(lane.lane_id)
         return {name: tuple(before) for name, before in found.items()}
 
+    def straightest(self, lanes: Iterable[Lane], *, forwards: bool = True) -> Lane:
+        """The lane that turns least; of equal ones, that to the side on which traffic drives."""
+
+        def order(lane: Lane) -> tuple[float, float, str]:
+            left = lane.turn if forwards else -lane.turn
+            place = self.road_places.get(lane.lane_id)
+            right = place is None or self.road(place[0]).drives_right
+            return round(abs(left), 6), left if right else -left, lane.lane_id
+
+        return min(lanes, key=order)
+
     @cached_property
     def road_places(self) -> Mapping[str, tuple[str, int]]:
         """(road id, lane number) by lane id, for lanes on roads."""

@@ -81,6 +81,16 @@ def private(entity: str, *actions: str) -> str:
     return f'<Private entityRef="{entity}">{made}</Private>'
 
 
+def of_target(condition: str, inside: str = "") -> str:
+    """A start trigger of an entity condition of the target."""
+    tag = condition.split(maxsplit=1)[0]
+    return f"""<StartTrigger><ConditionGroup><Condition name="c" delay="0" conditionEdge="none">
+    <ByEntityCondition><TriggeringEntities triggeringEntitiesRule="any">
+    <EntityRef entityRef="Target"/></TriggeringEntities><EntityCondition>
+    <{condition}>{inside}</{tag}>
+    </EntityCondition></ByEntityCondition></Condition></ConditionGroup></StartTrigger>"""
+
+
 EGO = private("Ego", put(lane(-2, 50.0)), speed(10.0))
 TARGET = private("Target", put(lane(-1, 110.0)), speed(10.0))
 
@@ -210,6 +220,28 @@ def test_a_route_outlasts_a_teleport_onto_it(run):
 
     ego = found.ego[-1]
     assert (ego.x, ego.y) == (pytest.approx(150.0, abs=1.0), pytest.approx(46.5, abs=1.0))
+
+
+def test_a_lane_change_on_a_route_keeps_the_route(run):
+    # Without a map the route turns to the left off the road, at x = 150 m.
+    there = ((50.0, -3.5), (150.0, -3.5), (150.0, 100.0))
+    points = "".join(
+        f'<Waypoint routeStrategy="shortest"><Position><WorldPosition x="{x}" y="{y}"/></Position>'
+        "</Waypoint>"
+        for x, y in there
+    )
+    route = f"""<RoutingAction><AssignRouteAction><Route name="r" closed="false">{points}</Route>
+    </AssignRouteAction></RoutingAction>"""
+    init = private("Ego", put(lane(-2, 50.0)), route, speed(30.0))
+    text = scenario(
+        init=init + private("Target", put(lane(-2, 400.0))),
+        actor="Ego", action=CUT_IN.replace('value="-2"', 'value="-1"'),
+    )  # fmt: skip
+    ego = run(text.replace('<LogicFile filepath="road.xodr"/>', "")).ego[-1]
+
+    # It drives along its route, a lane further to the left.
+    assert ego.yaw == pytest.approx(math.pi / 2)
+    assert ego.x == pytest.approx(146.5, abs=1e-6)
 
 
 def test_an_ego_without_a_speed_stands_still(run):
@@ -597,6 +629,22 @@ def test_a_continuous_relative_speed_has_its_transition(run):
     assert found[-1].speed == pytest.approx(12.0)
 
 
+def test_a_relative_speed_is_reached_at_the_other_s_speed_at_that_time(run):
+    how = 'dynamicsShape="linear" dynamicsDimension="rate" value="{}"'
+    action = speed(0.0, how.format(3)).replace(
+        '<AbsoluteTargetSpeed value="0.0"/>',
+        '<RelativeTargetSpeed entityRef="Target" value="0" speedTargetValueType="delta" '
+        'continuous="false"/>',
+    )
+    init = private("Ego", put(lane(-2, 50.0)))
+    init += private("Target", put(lane(-1, 60.0)), speed(30.0, how.format(2)))
+    found = run(scenario(actor="Ego", action=action, init=init), seconds=4.0).ego
+
+    # 3 (t - 0.5) = 2 t at t = 1.5 s, when both drive 3 m/s.
+    assert found[10].speed == pytest.approx(1.5, abs=0.05)
+    assert found[-1].speed == pytest.approx(3.0, abs=0.05)
+
+
 def test_an_entity_drives_on_to_the_next_road_and_stops_at_its_end(run):
     init = private("Ego", put(lane(-2, 580.0)), speed(20.0)) + TARGET
     found = run(scenario(init=init), seconds=12.0).ego
@@ -662,6 +710,44 @@ def test_a_heading_in_a_lane_is_that_of_its_centre_line(run, tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("condition", "begins"),
+    [
+        # The ego passes at 10 m/s, from left to right of the target, which heads to the left.
+        ('rule="greaterThan" value="9" direction="lateral"', [0.0]),
+        ('rule="lessThan" value="-1" direction="longitudinal"', []),
+        ('rule="lessThan" value="-9"', [0.0]),
+    ],
+)
+def test_a_relative_speed_has_directions_of_the_triggering_entity(run, condition, begins):
+    across = lane(-1, 110.0).replace("/>", '><Orientation type="relative" h="1.5707963"/>')
+    init = EGO + private("Target", put(across + "</LanePosition>"), speed(0.0))
+    begin = of_target(f'RelativeSpeedCondition entityRef="Ego" {condition}')
+    found = run(scenario(init=init, event_start=begin), seconds=0.5)
+
+    assert found.begins("event") == pytest.approx(begins, abs=0.011)
+
+
+@pytest.mark.parametrize(
+    ("attributes", "begins"),
+    [
+        # Beside each other in neighbouring lanes: 3.5 m at 10 m/s, or 0 m along the road.
+        ("", []),
+        ('alongRoute="false"', []),
+        ('alongRoute="true"', [0.0]),
+        ('relativeDistanceType="longitudinal"', [0.0]),
+    ],
+)
+def test_a_headway_is_that_of_the_straight_distance_unless_a_type_is_given(run, attributes, begins):
+    ruled = 'entityRef="Ego" freespace="false" rule="lessThan" value="0.3"'
+    start = of_target(f"TimeHeadwayCondition {ruled} {attributes}")
+    init = private("Ego", put(lane(-2, 50.0)), speed(10.0))
+    init += private("Target", put(lane(-1, 50.0)), speed(10.0))
+    found = run(scenario(init=init, event_start=start), seconds=0.5)
+
+    assert found.begins("event") == pytest.approx(begins, abs=0.011)
+
+
+@pytest.mark.parametrize(
     ("lanes", "opposite", "begins"),
     [
         # The ego is 10 m behind in the same lane and falls back by 10 m/s.
@@ -672,13 +758,11 @@ def test_a_heading_in_a_lane_is_that_of_its_centre_line(run, tmp_path):
     ],
 )
 def test_a_clearance_needs_a_lane_without_entities(run, lanes, opposite, begins):
-    clear = f"""<StartTrigger><ConditionGroup><Condition name="clear" delay="0"
-    conditionEdge="none"><ByEntityCondition><TriggeringEntities
-    triggeringEntitiesRule="any"><EntityRef entityRef="Target"/></TriggeringEntities>
-    <EntityCondition><RelativeClearanceCondition distanceForward="5" distanceBackward="20"
-    freeSpace="false" oppositeLanes="{opposite}"><RelativeLaneRange from="{lanes[0]}"
-    to="{lanes[1]}"/></RelativeClearanceCondition></EntityCondition></ByEntityCondition>
-    </Condition></ConditionGroup></StartTrigger>"""
+    clear = of_target(
+        'RelativeClearanceCondition distanceForward="5" distanceBackward="20" freeSpace="false" '
+        f'oppositeLanes="{opposite}"',
+        f'<RelativeLaneRange from="{lanes[0]}" to="{lanes[1]}"/>',
+    )
     init = private("Ego", put(lane(-1, 100.0)), speed(0.0))
     init += private("Target", put(lane(-1, 110.0)), speed(10.0))
     found = run(scenario(init=init, event_start=clear), seconds=2.0)

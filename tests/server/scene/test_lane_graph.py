@@ -37,6 +37,19 @@ def bend(radius=30.0, count=60):
     return Lane("bend", "driving", line, np.full(count, 4.0))
 
 
+def test_of_lanes_that_turn_equally_the_right_one_is_straight_on():
+    line, width = (
+        np.column_stack([np.arange(9.0), np.arange(9.0) ** 2 / 20, np.zeros(9)]),
+        np.full(9, 3.5),
+    )
+    left = Lane("a", "driving", line, width)
+    right = Lane("b", "driving", line * (1, -1, 1), width)
+    graph = LaneGraph.of([left, right, straight("c")])
+
+    assert graph.straightest([left, right]).lane_id == "b"
+    assert graph.straightest([left, right, graph.lane("c")]).lane_id == "c"
+
+
 @pytest.mark.parametrize("offset", [-1.5, 0.0, 1.2])
 def test_nearest_inverts_a_position_in_a_lane(offset):
     lane = bend()

@@ -352,12 +352,8 @@ class Conditions:
         return {"kind": "time_to_collision", **of, **_ruled(part), **_measured(part)}
 
     def _headway(self, part: Part) -> Fields:
-        measured = {"measure": "longitudinal"} | _measured(part)
-        if "relativeDistanceType" not in part.raw.attributes:
-            measured["measure"] = "longitudinal"
-        return {
-            "kind": "time_headway", "entity": part.text("entityRef"), **_ruled(part), **measured,
-        }  # fmt: skip
+        of = {"entity": part.text("entityRef")}
+        return {"kind": "time_headway", **of, **_ruled(part), **_measured(part)}
 
     def _relative_distance(self, part: Part) -> Fields:
         of = {"entity": part.text("entityRef")}

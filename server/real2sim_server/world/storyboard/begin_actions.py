@@ -44,6 +44,7 @@ from .motion import (
     duration_at,
     gentle_duration,
     offset_of,
+    speed_duration,
 )
 from .roads import Place, RoadPoint, Trajectory, Way, course_of, path_through
 from .view import ACROSS, EntityState, PositionResolver, View, across, distance_ahead
@@ -112,37 +113,26 @@ def _on_lane(actor: EntityState, at: Beginning) -> EntityState:
 def _speed(actor: EntityState, action: SpeedAction, at: Beginning) -> EntityState:
     actor = _freed(actor)
     value, dynamics = float(action.speed), _dynamics(action.dynamics)
+    follow = None
     if action.relative_to is not None:
-        other = at.view.entities[action.relative_to].speed
-        value = other + value if action.relation == "delta" else other * value
+        follow = FollowSpeed(
+            at.token, action.relative_to, action.relation, value, dynamics, actor.speed,
+            action.continuous,
+        )  # fmt: skip
+        value = follow.wanted(at.view)
     limits = actor.performance
     if limits.speed is not None:
         value = min(max(value, -float(limits.speed)), float(limits.speed))
-    seconds = _speed_duration(dynamics, actor.speed, value)
+    seconds = speed_duration(dynamics, actor.speed, value)
+    if follow is not None and (action.continuous or seconds > 0.0):
+        return copy_with(actor, speed=actor.speed if seconds > 0.0 else value, longitudinal=follow)
     most = limits.acceleration if value > actor.speed else limits.deceleration
     if seconds > 0.0 and most is not None:
         seconds = max(seconds, duration_at(dynamics.shape, value - actor.speed, float(most)))
-    if action.continuous and action.relative_to is not None:
-        follow = FollowSpeed(
-            at.token, action.relative_to, action.relation, float(action.speed), dynamics.shape,
-            actor.speed, seconds,
-        )  # fmt: skip
-        return copy_with(actor, speed=actor.speed if seconds > 0.0 else value, longitudinal=follow)
     if seconds <= 0.0:
         return _done(actor, at, speed=value, longitudinal=None)
     change = SpeedChange(at.token, dynamics.shape, actor.speed, value, seconds)
     return copy_with(actor, longitudinal=change)
-
-
-def _speed_duration(dynamics: Dynamics, start: float, end: float) -> float:
-    """Duration of a speed change [s].
-
-    All shapes have the mean of both speeds as their mean, so a distance determines the duration.
-    """
-    if dynamics.dimension != "distance" or dynamics.shape == "step":
-        return duration(dynamics, end - start)
-    mean = (start + end) / 2
-    return float(dynamics.value) / mean if mean > 0 else 0.0
 
 
 def _speed_profile(actor: EntityState, action: SpeedProfileAction, at: Beginning) -> EntityState:
@@ -226,8 +216,11 @@ def _lane_change(actor: EntityState, action: LaneChangeAction, at: Beginning) ->
         base = _where(other, at, "lane change relative to it")
         sense = 1 if math.cos(other.h - base.h) >= 0.0 else -1
         lane = network.neighbour(base.road, base.lane, base.s, lane * sense)
-    actor = actor.on_way(network.way(here.road, lane, here.s, along=along))
     end = float(action.offset) * (1.0 if along else -1.0)
+    if actor.way is not None and actor.way.assigned:
+        end += _offset_of_lane(actor, here, lane, at)
+    else:
+        actor = actor.on_way(network.way(here.road, lane, here.s, along=along))
     dynamics, change = _dynamics(action.dynamics), end - actor.offset
     by_way = dynamics.dimension == "distance" and dynamics.shape != "step"
     extent = float(dynamics.value) if by_way else duration(dynamics, change)
@@ -235,18 +228,33 @@ def _lane_change(actor: EntityState, action: LaneChangeAction, at: Beginning) ->
 
 
 def _lane_offset(actor: EntityState, action: LaneOffsetAction, at: Beginning) -> EntityState:
-    # From now on, offsets of an entity off the road or on a route refer to the centre of its lane.
-    actor = _on_lane(actor, at).on_lane(at.view.network)
-    value, acceleration = float(action.offset), action.acceleration
+    actor, network = _on_lane(actor, at), at.view.network
+    base, here = 0.0, network.locate(actor.x, actor.y, actor.h)
+    if here is not None and actor.way is not None and actor.way.assigned:
+        base = _offset_of_lane(actor, here, here.lane, at)
+    else:
+        # From now on, offsets of an entity off the road refer to the centre of its lane.
+        actor = actor.on_lane(network)
+    value, acceleration = base + float(action.offset), action.acceleration
     if action.relative_to is not None:
+        left = float(action.offset)
         if action.continuous and acceleration is None:
-            return copy_with(actor, lateral=FollowOffset(at.token, action.relative_to, value))
-        value = offset_of(at.view.entities[action.relative_to], actor, at.view, value)
+            return copy_with(actor, lateral=FollowOffset(at.token, action.relative_to, left))
+        value = offset_of(at.view.entities[action.relative_to], actor, at.view, left)
     if action.continuous and acceleration is None:
         return copy_with(actor, lateral=HoldOffset(at.token, value))
     most = None if acceleration is None else float(acceleration)
     extent = gentle_duration(action.shape, value - actor.offset, most)
-    return _shifted(actor, action.shape, value, extent, at)
+    return _shifted(actor, action.shape, value, extent, at, beside=True)
+
+
+def _offset_of_lane(actor: EntityState, here: RoadPoint, lane: int, at: Beginning) -> float:
+    """Offset from an entity's path of the centre of a lane of its road [m]."""
+    network = at.view.network
+    centre = network.place(here.road, here.s, network.middle(here.road, lane, here.s))
+    assert actor.way is not None
+    yaw = actor.way.path.at(actor.s)[3]
+    return actor.offset + across(yaw, centre.x - actor.x, centre.y - actor.y)
 
 
 def _shifted(
@@ -257,10 +265,11 @@ def _shifted(
     at: Beginning,
     *,
     by_way: bool = False,
+    beside: bool = False,
 ) -> EntityState:
     if extent <= 0.0:
         return _done(copy_with(actor, lateral=None, offset=end, drift=0.0).placed(), at)
-    change = OffsetChange(at.token, shape, actor.offset, end, extent, by_way)
+    change = OffsetChange(at.token, shape, actor.offset, end, extent, by_way, beside)
     return copy_with(actor, lateral=change)
 
 

@@ -88,13 +88,12 @@ def gentle_duration(shape: Shape, change: float, acceleration: float | None) -> 
     return math.sqrt(CURVIEST[shape] * abs(change) / max(acceleration, 1e-6))
 
 
-AT_PLACE = 0.01
-"""Tolerance of lateral distances [m]."""
-
-
 @dataclass(frozen=True)
 class OffsetChange:
-    """Changes the offset with a shape over time or distance."""
+    """Changes the offset with a shape over time or distance.
+
+    The speed is that of the whole motion, or that along the path (``beside``).
+    """
 
     token: int
     shape: Shape
@@ -102,6 +101,7 @@ class OffsetChange:
     end: float
     extent: float
     by_way: bool = False
+    beside: bool = False
     done: float = 0.0
 
     def step(self, actor: EntityState, view: View, way: float, h: float) -> Shifted:
@@ -232,7 +232,7 @@ class SpeedCourse:
 
 @dataclass(frozen=True)
 class FollowSpeed:
-    """Changes to a speed relative to another entity with a shape over time, and keeps it.
+    """Changes to a speed relative to another entity's current speed, and keeps it if continuous.
 
     The speed changes within the performance of the entity.
     """
@@ -241,21 +241,38 @@ class FollowSpeed:
     other: str
     relation: str
     value: float
-    shape: Shape
+    dynamics: Dynamics
     start: float
-    duration: float
+    continuous: bool
     elapsed: float = 0.0
+
+    def wanted(self, view: View) -> float:
+        """Target speed at this instant [m/s]."""
+        speed = view.entities[self.other].speed
+        return speed + self.value if self.relation == "delta" else speed * self.value
 
     def step(self, actor: EntityState, view: View, h: float) -> Moved:
         """The motion after ``h`` seconds."""
-        speed, elapsed = view.entities[self.other].speed, self.elapsed + h
-        wanted = speed + self.value if self.relation == "delta" else speed * self.value
-        if elapsed < self.duration:
-            wanted = self.start + (wanted - self.start) * progress(
-                self.shape, elapsed / self.duration
-            )
-        end = within_performance(actor, wanted, h)
-        return Moved((actor.speed + end) / 2 * h, end, replace(self, elapsed=elapsed))
+        target, elapsed = self.wanted(view), self.elapsed + h
+        speed, seconds = target, speed_duration(self.dynamics, self.start, target)
+        if elapsed < seconds - DONE:
+            share = progress(self.dynamics.shape, elapsed / seconds)
+            speed = self.start + (target - self.start) * share
+        end = within_performance(actor, speed, h)
+        reached = elapsed >= seconds - DONE and abs(end - target) <= DONE
+        then = None if reached and not self.continuous else replace(self, elapsed=elapsed)
+        return Moved((actor.speed + end) / 2 * h, end, then)
+
+
+def speed_duration(dynamics: Dynamics, start: float, end: float) -> float:
+    """Duration of a speed change [s].
+
+    All shapes have the mean of both speeds as their mean, so a distance determines the duration.
+    """
+    if dynamics.dimension != "distance" or dynamics.shape == "step":
+        return duration(dynamics, end - start)
+    mean = (start + end) / 2
+    return float(dynamics.value) / mean if mean > 0 else 0.0
 
 
 def within_performance(actor: EntityState, speed: float, h: float) -> float:
@@ -477,6 +494,8 @@ class FollowIdm:
 
 def advanced(actor: EntityState, view: View, h: float) -> EntityState:
     """An entity ``h`` seconds later, moved by its actions; a planner's ego keeps its motion."""
+    if not actor.present:
+        return actor
     if not actor.scripted:
         return coasting(actor, h)
     control = actor.longitudinal
@@ -500,19 +519,21 @@ def _on_way(actor: EntityState, view: View, way: float, h: float) -> EntityState
         offset, then = control.step(actor, view, way, h)
         if then is None:
             finished |= {control.token}
-    # The speed is that of the whole motion, along the path and across it.
-    aside = min(abs(offset - actor.offset), abs(way))
-    ahead = math.copysign(math.sqrt(way * way - aside * aside), way)
+    aside, ahead = offset - actor.offset, way
+    if not (isinstance(control, OffsetChange) and control.beside):
+        aside = min(max(aside, -abs(way)), abs(way))
+        ahead = math.copysign(math.sqrt(way * way - aside * aside), way)
+    whole = math.hypot(ahead, aside)
     moved = copy_with(
         actor,
         s=actor.s + ahead / _stretch(actor),
         offset=offset,
         turn=actor.turn if control is None else 0.0,
         # The lateral motion of a change is over at its end, also if its shape ends abruptly.
-        drift=(offset - actor.offset) / h if then is not None else 0.0,
+        drift=aside / whole * abs(actor.speed) if then is not None and whole > 0.0 else 0.0,
         lateral=then,
         finished=finished,
-        travelled=actor.travelled + abs(way),
+        travelled=actor.travelled + whole,
     )
     return _within_road(moved, view).placed()
 

@@ -47,6 +47,7 @@ from .view import (
     EntityState,
     PositionResolver,
     View,
+    across,
     along,
     box_corners_of,
     closing_speed,
@@ -595,13 +596,18 @@ def _reach_position(
 
 
 def _speed(test: Speed, context: ConditionContext, since: Mapping[str, float]) -> Outcome:
-    def part(actor: EntityState) -> float:
-        return actor.drift if test.direction == "lateral" else actor.speed
+    other = None if test.relative_to is None else context.view.entities[test.relative_to]
 
     def holds(actor: EntityState) -> bool:
-        value = part(actor)
-        if test.relative_to is not None:
-            value -= part(context.view.entities[test.relative_to])
+        if test.direction is None:
+            value = actor.speed - (0.0 if other is None else other.speed)
+        elif other is None:
+            value = actor.drift if test.direction == "lateral" else actor.speed
+        else:
+            # Relative velocity, projected to the axes of the triggering entity.
+            (vx, vy), (ux, uy) = actor.velocity, other.velocity
+            component = across if test.direction == "lateral" else along
+            value = component(actor.h, vx - ux, vy - uy)
         return _compared(value, test.rule, float(test.value))
 
     return _of_entities(test, context, since, holds)

@@ -321,11 +321,12 @@ class Progress:
     def _global(self, action: Any, t_us: int, elapsed: float) -> None:
         if isinstance(action, AddEntityAction):
             actor = self.entities[action.entity]
-            if not actor.visible:
+            if not actor.present:
                 put = actor.put(self._places().of(action.position), self._network)
-                self.entities[action.entity] = copy_with(put, visible=True)
+                self.entities[action.entity] = copy_with(put, present=True, visible=True)
         elif isinstance(action, DeleteEntityAction):
-            self.entities[action.entity] = copy_with(self.entities[action.entity], visible=False)
+            actor = self.entities[action.entity]
+            self.entities[action.entity] = copy_with(actor, present=False, visible=False)
         elif isinstance(action, SignalStateAction):
             self._states[action.signal] = action.state
         elif isinstance(action, SignalPhaseAction):

@@ -210,22 +210,39 @@ def straight(x: float, y: float, h: float, *, z: float = 0.0) -> LoggedPath:
     return LoggedPath.through(np.array([[x, y, z], ahead]), np.array([h, h]), ups)
 
 
+SAME_PLACE = 0.01
+"""Places on a path that are closer than this count as one [m]."""
+
+
 def path_through(places: list[Place]) -> LoggedPath:
-    """The polyline through places, of which at least two must differ."""
-    points = np.array([(p.x, p.y, p.z or 0.0) for p in places])
-    steps = np.diff(points[:, :2], axis=0)
-    kept = np.concatenate([[True], np.hypot(steps[:, 0], steps[:, 1]) > 1e-6])
-    points = points[kept]
+    """The polyline through places, of which at least two must differ.
+
+    Its heading turns within ``CORNER`` of the places.
+    """
+    kept = places[:1]
+    for place in places[1:]:
+        if math.hypot(place.x - kept[-1].x, place.y - kept[-1].y) > SAME_PLACE:
+            kept.append(place)
+    points = np.array([(p.x, p.y, p.z or 0.0) for p in kept])
     if len(points) < 2:
         raise WorldError(
             ErrorCode.INVALID_REQUEST,
             "a route or trajectory leads nowhere: all its places are the same",
             hint="give two places at least",
         )
-    steps = np.diff(points[:, :2], axis=0)
+    steps = np.diff(points, axis=0)
     yaws = np.unwrap(np.arctan2(steps[:, 1], steps[:, 0]))
-    ups = np.tile([0.0, 0.0, 1.0], (len(points), 1))
-    return LoggedPath.through(points, np.append(yaws, yaws[-1]), ups)
+    turned = np.concatenate([yaws[:1], (yaws[:-1] + yaws[1:]) / 2, yaws[-1:]])
+    rows = [(*points[0], turned[0])]
+    for a, step, yaw, b, after in zip(points, steps, yaws, points[1:], turned[1:], strict=False):
+        # Along a straight part the path has its direction; it turns near the places.
+        near = CORNER / float(np.hypot(*step[:2]))
+        if near < 0.5:
+            rows += [(*(a + near * step), yaw), (*(b - near * step), yaw)]
+        rows.append((*b, after))
+    found = np.array(rows)
+    ups = np.tile([0.0, 0.0, 1.0], (len(found), 1))
+    return LoggedPath.through(found[:, :3], found[:, 3], ups)
 
 
 REACH = 2000.0
@@ -362,7 +379,7 @@ class GraphNetwork:
         lane, before = self.graph.lane(lane_id), self.graph.predecessors
         names = lane.successors if forwards else before[lane_id]
         onward = [found for n in names if (found := self.graph.lane(n)) not in besides]
-        return min(onward, key=lambda each: (each.turn, each.lane_id), default=None)
+        return self.graph.straightest(onward, forwards=forwards) if onward else None
 
     def _path(self, lane_id: str, *, forwards: bool) -> tuple[LoggedPath, float]:
         lanes, length = [self.graph.lane(lane_id)], 0.0

@@ -467,7 +467,7 @@ def _first(
     scripted = entity.kind != "ego" or board.drives_ego
     actor = EntityState(
         entity.name, entity.category, subject, size, centre, 0.0, 0.0, 0.0,
-        scripted=scripted, visible=entity.kind == "ego",
+        scripted=scripted,
         performance=SpeedLimits(
             speed=entity.max_speed,
             acceleration=entity.max_acceleration,
@@ -479,7 +479,7 @@ def _first(
     if entity.kind == "new":
         placed = any(e.entity == entity.name and e.action.kind in PLACING for e in board.init)
         there = EntityState.put(actor, Place(0.0, 0.0, 0.0), network)
-        return copy_with(there, visible=placed)
+        return copy_with(there, present=placed, visible=placed)
     assert subject is not None
     track = subject.trajectory
     t_us = min(max(surroundings.t_us, track.start_us), track.end_us)
@@ -491,7 +491,7 @@ def _first(
         pose.yaw,
     )
     speed = pose.velocity[0] * cos + pose.velocity[1] * sin
-    return copy_with(actor, speed=speed, visible=True).put(place, network)
+    return copy_with(actor, speed=speed).put(place, network)
 
 
 def _nothing_yet(program: Program) -> ProgressState:

@@ -91,7 +91,8 @@ class EntityState:
         s, offset: distance along the path, and offset from it [m].
         turn: heading relative to the path, besides that of its drift [rad].
         travelled: distance travelled since the start of the episode [m].
-        visible: whether it is in the world.
+        present: whether it has been added and not deleted; others do not move.
+        visible: whether it is seen.
         scripted: whether the storyboard moves it.
         longitudinal, lateral: active controllers, or None.
         trajectory: trajectory that it follows instead of its path, or None.
@@ -116,6 +117,7 @@ class EntityState:
     offset: float = 0.0
     turn: float = 0.0
     travelled: float = 0.0
+    present: bool = True
     visible: bool = True
     scripted: bool = True
     longitudinal: Longitudinal | None = None

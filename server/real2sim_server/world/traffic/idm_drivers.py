@@ -107,7 +107,7 @@ def _chain(
         onward = [n for n in _travelled(graph, names(at)) if n is not lane and n not in found]
         if not onward:
             break
-        at = min(onward, key=lambda one: (one.turn, one.lane_id))
+        at = graph.straightest(onward)
         found.append(at)
         length += at.length
     return found

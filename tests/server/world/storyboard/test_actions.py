@@ -7,6 +7,8 @@ import math
 import numpy as np
 import pytest
 
+from real2sim_server.world.storyboard.roads import Place, path_through
+
 from .boards import action_at, after, board, drive, event, places, speeds
 
 NEAR = 0.05
@@ -98,6 +100,14 @@ def test_a_lane_offset_keeps_its_highest_acceleration(run):
     assert y[80] == pytest.approx(-1.2)
     half = 10 + duration / 2 * 10
     assert np.interp(half, np.arange(81), y) == pytest.approx(-0.6, abs=NEAR)
+
+
+def test_a_lane_offset_leaves_the_speed_along_the_lane(run):
+    aside = {"kind": "lane_offset", "offset": -3.0, "shape": "sinusoidal", "acceleration": 5.0}
+    x = places(run(action_at(1.0, aside)))[:, 0]
+
+    # Its centre is ahead of its reference point, so it falls behind while it is at an angle.
+    assert x[80] - x[0] == pytest.approx(80.0, abs=1e-6)
 
 
 def test_synchronised_entities_arrive_together(run):
@@ -202,6 +212,15 @@ def test_it_goes_on_along_a_trajectory_whose_vertices_turn_it_around(run):
     assert places(worlds)[11:45, 0] == pytest.approx(30.0 + np.arange(1, 35), abs=NEAR)
 
 
+def test_the_heading_of_a_route_turns_near_its_places():
+    places = [Place(0, 0, 0), Place(50, 0, 0), Place(50 - 1e-3, 1e-4, 0), Place(50, 60, 0)]
+    path = path_through(places)
+
+    assert path.at(47.0)[3] == pytest.approx(0.0)
+    assert path.at(50.0)[3] == pytest.approx(math.pi / 4)
+    assert path.at(53.0)[3] == pytest.approx(math.pi / 2)
+
+
 def test_a_lane_offset_is_to_the_left_of_the_entity_that_it_refers_to(run):
     oncoming = {"kind": "world", "x": 200.0, "y": 5.25, "h": math.pi}
     init = [("other", {"kind": "teleport", "position": oncoming})]
@@ -274,6 +293,18 @@ def test_an_entity_that_is_there_is_not_added_again(run):
     worlds = run(action_at(1.0, add), steps=20)
 
     assert places(worlds)[20, 0] == pytest.approx(places(worlds)[0, 0] + 20.0)
+
+
+def test_a_deleted_entity_does_not_move_until_it_is_added_again(run):
+    again = {"kind": "relative_lane", "entity": "car", "ds": 30.0}
+    worlds = run(
+        action_at(1.0, {"kind": "delete_entity", "entity": "car"}),
+        action_at(3.0, {"kind": "add_entity", "entity": "car", "position": again}),
+        steps=40,
+    )
+
+    x = places(worlds)[:, 0]
+    assert x[40] - x[0] == pytest.approx(10.0 + 30.0 + 10.0, abs=0.2)
 
 
 def test_an_entity_appears_where_it_is_put_and_leaves(run):
