@@ -47,6 +47,8 @@ def compare(batch: BatchWorld, w: int, world: World, at_fault: int) -> None:
     assert (world.terminated, world.truncated) == (batch.terminated[w], batch.truncated[w])
     assert world.accumulator.off_road == batch.off_road[w]
     assert world.contacts.touching == batch.touching[w]
+    ids = [i.instance_id for i in world.instances()]
+    assert sorted(i.instance_id for i in batch.instances(w)) == sorted(ids)
     assert sum(world.accumulator.at_fault.values()) == at_fault
 
 
@@ -208,8 +210,9 @@ def test_malformed_actions_are_refused(
         batch.step(actions, plan_us=plan_us)
 
 
-def test_shown_arrays_match_the_instances(street: Scene) -> None:
-    batch = BatchWorld(street, ResetSpec(action="control"), 2)
+@pytest.mark.parametrize("default", ["log", "idm"])
+def test_shown_arrays_match_the_instances(street: Scene, default: Any) -> None:
+    batch = BatchWorld(street, ResetSpec(action="control", agents={"default": default}), 2)
     batch.reset([1], start_us=[street.start_us + 3_000_000])
     shown = batch.shown([0, 1])
     assert shown is not None
