@@ -130,6 +130,26 @@ def test_objects_appear_and_disappear_as_in_single_worlds(
         drive_beside(scene, fields, worlds=3, steps=40)
 
 
+def test_brake_lamps_show_as_in_single_worlds(
+    make_scene: Callable[..., Scene], moving: Callable[..., Any]
+) -> None:
+    scene = make_scene(car=moving(14, speed=8.0), stands=moving(60))
+    spec, state = ResetSpec(action="control", agents={"default": "idm"}), ScenarioState.of(scene)
+    batch, world = BatchWorld(scene, spec, 1, state=state), World(scene, state, spec)
+    seen = []
+    for _ in range(50):
+        batch.step([[-4.0, 0.0]])
+        world.step(Control(acceleration=-4.0, steering=0.0))
+        shown = batch.shown([0])
+        assert shown is not None
+        lit = world.lamps == {"car": ("brake",)}
+        assert shown.there[0].tolist() == [True, True, True, lit]
+        assert len(world.instances()) == len(batch.instances(0)) == 3 + lit
+        seen.append(lit)
+    assert not seen[0]
+    assert seen[-1]
+
+
 def test_reset_restarts_only_the_selected_worlds(street: Scene) -> None:
     spec = ResetSpec(action="control", horizon=3)
     batch = BatchWorld(street, spec, 4)
