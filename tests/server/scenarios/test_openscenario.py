@@ -166,6 +166,18 @@ def test_lamps_are_read_back_as_written_and_other_lights_are_noted():
     assert (again.board.init, again.board.stories) == (written.init, written.stories)
     assert not again.notes
 
+    looks = text.replace("<LightStateAction>", '<LightStateAction transitionTime="0.2">')
+    looks = looks.replace(
+        'mode="on" />',
+        'mode="on" luminousIntensity="900"><Color colorType="red"><ColorRgb red="1" green="0" '
+        'blue="0" /></Color></LightState>',
+    )
+    noted = read_openscenario_text(looks.encode(), "case.xosc")
+    assert noted.board.stories == written.stories
+    assert [n.split(" is ignored")[0] for n in sorted(noted.notes)] == [
+        "<Color>", "luminousIntensity of <LightState>", "transitionTime of <LightStateAction>",
+    ]  # fmt: skip
+
     fog = read_openscenario_text(text.replace("brakeLights", "fogLights").encode(), "case.xosc")
     kinds = [action.kind for _, action in story_actions(fog.board)]
     assert kinds == ["custom", "light_state", "light_state", "light_state"]
