@@ -132,6 +132,9 @@ class EgoState(ServerModel):
     size: Vector3 = Field(description="box length, width, height [m]")
 
 
+Lamp = Literal["brake", "indicator_left", "indicator_right"]
+
+
 class AgentState(ServerModel):
     """Another road user at one time."""
 
@@ -152,6 +155,9 @@ class AgentState(ServerModel):
     quaternion: Quaternion
     velocity: Vector3 = Field(description="world [m/s]")
     size: Vector3
+    lamps: list[Annotated[str, one_of(Lamp)]] = Field(
+        default_factory=list, description="lit lamps at this time"
+    )
 
 
 EventType = Literal[

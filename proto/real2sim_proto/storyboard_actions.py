@@ -427,6 +427,18 @@ class VisibilityAction(Model):
     visible: bool
 
 
+class LightStateAction(Model):
+    """Switches a lamp of the entity, at once."""
+
+    kind: Literal["light_state"] = "light_state"
+    lamp: Literal["brake", "indicator_left", "indicator_right", "hazard"] = Field(
+        description="'hazard': both indicators, whatever their own states are"
+    )
+    mode: Literal["on", "off", "flashing"] = "on"
+    on_time: Value = Field(default=0.5, description="lit part of a flash, which is first [s]")
+    off_time: Value = Field(default=0.5, description="dark part of a flash [s]")
+
+
 class FollowingParameters(Model):
     """Parameters of the intelligent driver model (Treiber et al. 2000), as for the driver
     ``idm``."""
@@ -468,6 +480,7 @@ PrivateAction = Annotated[
     | AcquirePositionAction
     | TeleportAction
     | VisibilityAction
+    | LightStateAction
     | ControllerAction,
     Field(discriminator="kind"),
 ]
@@ -515,7 +528,7 @@ class SetVariableAction(Model):
 
 
 class CustomAction(Model):
-    """Does nothing; keeps the place of an action that has no effect here, such as lamps."""
+    """Does nothing; keeps the place of an action that has no effect here, such as weather."""
 
     kind: Literal["custom"] = "custom"
     type: str = Field(max_length=200, description="what the action is, for other programs")
@@ -544,6 +557,7 @@ AnyAction = Annotated[
     | AcquirePositionAction
     | TeleportAction
     | VisibilityAction
+    | LightStateAction
     | ControllerAction
     | AddEntityAction
     | DeleteEntityAction

@@ -1,15 +1,18 @@
-"""Appearance of edits: ground under removed objects, contact shadows, lighting."""
+"""Appearance of edits: ground under removed objects, contact shadows, lamps, lighting."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Hashable, Iterable, Mapping
 from dataclasses import replace
 from functools import cache, lru_cache
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
 from torch import Tensor
+
+from real2sim_proto.drive import Lamp
 
 from ..geometry import (
     Float,
@@ -22,6 +25,8 @@ from ..render.types import Instance
 from ..scene import UNSEEN, GaussianCloud, Ground, Scene
 from ..scene.cloud import SH_C0
 from .state import ObjectState, ScenarioState
+
+Colour = tuple[float, float, float]
 
 PARKED = 0.5
 """An object is parked if all its recorded positions are within this distance of each other [m];
@@ -198,9 +203,103 @@ def _decal(level: int, device: str) -> GaussianCloud:
     return decal.to(device)
 
 
-# --- Lighting ------------------------------------------------------------------------------------
+# --- Lamps ---------------------------------------------------------------------------------------
 
-Colour = tuple[float, float, float]
+# A lit lamp is a few Gaussians of its colour on the surface of the body, with a bright core.
+
+GLOW: Mapping[Lamp, tuple[Colour, Colour]] = {
+    "brake": ((1.0, 0.03, 0.02), (1.0, 0.45, 0.35)),
+    "indicator_left": ((1.0, 0.42, 0.0), (1.0, 0.8, 0.35)),
+    "indicator_right": ((1.0, 0.42, 0.0), (1.0, 0.8, 0.35)),
+}
+"""Colour of a lamp, and of its core."""
+
+BRAKE_INSET, INDICATOR_INSET = 0.28, 0.12
+"""Distance of the centre of a lamp from the side of the box [m]."""
+
+LAMP_HEIGHT = 0.55, 0.9
+"""Height of lamps above the bottom of the box: part of its height, and the most [m]."""
+
+LAMP_SPREAD = (0.025, 0.065, 0.05)
+"""Standard deviations of a lamp along the axes of the object [m]."""
+
+BEYOND_BODY = 0.03
+"""Distance of lamps from the surface of the body [m]."""
+
+_lamp_clouds: WeakKeyDictionary[GaussianCloud, dict[Hashable, GaussianCloud]] = WeakKeyDictionary()
+
+
+def lamp_cloud(
+    body: GaussianCloud,
+    scale: tuple[float, float, float],
+    size: tuple[float, float, float],
+    lamps: tuple[Lamp, ...],
+) -> GaussianCloud:
+    """The light of ``lamps`` in the frame of the object, already scaled. Cached.
+
+    Args:
+        body: Gaussians of the object.
+        scale: scale of the body.
+        size: (length, width, height) of the scaled box [m].
+        lamps: the lit lamps.
+    """
+    known = _lamp_clouds.setdefault(body, {})
+    key = (scale, size, lamps)
+    if key not in known:
+        known[key] = _lamp_cloud(body, scale, size, lamps)
+    return known[key]
+
+
+def _lamp_cloud(
+    body: GaussianCloud,
+    scale: tuple[float, float, float],
+    size: tuple[float, float, float],
+    lamps: tuple[Lamp, ...],
+) -> GaussianCloud:
+    points = (
+        body.means[body.opacities > 0.5].cpu().double() * torch.tensor(scale).double()
+    ).numpy()
+    means, spreads, colours = [], [], []
+    for lamp in lamps:
+        for end, side in _corners(lamp):
+            inset = BRAKE_INSET if lamp == "brake" else INDICATOR_INSET
+            y = side * max(size[1] / 2 - inset, size[1] / 8)
+            z = min(LAMP_HEIGHT[0] * size[2], LAMP_HEIGHT[1]) - size[2] / 2
+            x = end * (_surface(points, end, y, z, size[0]) + BEYOND_BODY)
+            for core, colour in enumerate(GLOW[lamp]):
+                means.append((x + end * 0.01 * core, y, z))
+                spreads.append(np.array(LAMP_SPREAD) / (1 + core))
+                colours.append(colour)
+    count = len(means)
+    light = GaussianCloud(
+        means=torch.tensor(means, dtype=torch.float32),
+        quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
+        scales=torch.from_numpy(np.array(spreads)).float(),
+        opacities=torch.full((count,), 0.99),
+        sh=((torch.tensor(colours) - 0.5) / SH_C0)[:, None].contiguous(),
+    )
+    return light.to(body.device)
+
+
+def _corners(lamp: Lamp) -> list[tuple[float, float]]:
+    """Signs of the corners of a lamp: front 1 or rear -1, left 1 or right -1."""
+    if lamp == "brake":
+        return [(-1.0, 1.0), (-1.0, -1.0)]
+    side = 1.0 if lamp == "indicator_left" else -1.0
+    return [(1.0, side), (-1.0, side)]
+
+
+def _surface(points: Float, end: float, y: float, z: float, length: float) -> float:
+    """Distance of the body's surface from its centre towards an ``end`` at y, z [m].
+
+    That of the box where the body has no Gaussians.
+    """
+    x = end * points[:, 0]
+    near = (abs(points[:, 1:] - (y, z)) < 0.12).all(axis=1) & (x > length / 6)
+    return min(float(np.quantile(x[near], 0.95)), length / 2) if near.any() else length / 2
+
+
+# --- Lighting ------------------------------------------------------------------------------------
 
 AROUND = 20.0
 """Distance around the ego's path in which the background gives the ambient light [m]."""

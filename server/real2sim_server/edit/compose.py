@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from real2sim_proto.base import Pose
 from real2sim_proto.conventions import GROUND, STATIC, semantic_class
+from real2sim_proto.drive import Lamp
 from real2sim_proto.operations import EraseRegion
 
 from ..geometry import Float, invert_transform, quaternion_to_matrix, transform_from
@@ -24,7 +25,7 @@ from ..render.lens import TOLERANCE
 from ..render.types import Instance
 from ..scene import Figure, GaussianCloud, Lidar, Scene, Stride, Trajectory
 from ..scene.cloud import SH_C0
-from .appearance import contact_shadow, inpaint_ground, vacated_parking
+from .appearance import contact_shadow, inpaint_ground, lamp_cloud, vacated_parking
 from .motion import require_object
 from .state import ObjectState, ScenarioState
 from .tracks import PlacedObjects
@@ -123,6 +124,20 @@ def _standing(
         return Instance(cloud, *placement, semantic=semantic)
     colour = scene.object(subject.source_id).colour
     return Instance(cloud, *placement, colour=colour, t_us=t_us, semantic=semantic)
+
+
+def lamps_on(
+    scene: Scene, subject: ObjectState, shown: Instance, lamps: tuple[Lamp, ...]
+) -> Instance:
+    """The light of the lit ``lamps`` of an object that is drawn as ``shown``.
+
+    Raises:
+        UnknownObjectError: ``subject`` is of another scene.
+    """
+    asset = subject.asset
+    body = scene.object(subject.source_id).cloud if asset is None else asset.cloud_in(scene)
+    light = lamp_cloud(body, subject.scale, subject.scaled_size, lamps)
+    return replace(shown, cloud=light, scale=(1.0, 1.0, 1.0), covars=None, colour=None)
 
 
 def contact_shadows(

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from real2sim_proto.drive import EventType
+from real2sim_proto.drive import EventType, Lamp
 
 from ..edit import ObjectState, PlacedObjects
 from ..edit.compose import figure_of
@@ -41,7 +41,11 @@ def _all_rows(count: int) -> NDArray[np.int64]:
     return np.arange(count)
 
 
-def agent_fields(agents: Agents) -> list[dict[str, Any]]:
+Lamps = Mapping[str, tuple[Lamp, ...]]
+"""Lit lamps of the objects that have any, by id."""
+
+
+def agent_fields(agents: Agents, lamps: Lamps) -> list[dict[str, Any]]:
     """The wire's AgentState of each object, as plain maps."""
     poses = zip(
         agents.objects,
@@ -59,6 +63,7 @@ def agent_fields(agents: Agents) -> list[dict[str, Any]]:
             "quaternion": quaternion,
             "velocity": velocity,
             "size": size,
+            **({"lamps": lamps[subject.object_id]} if subject.object_id in lamps else {}),
         }
         for subject, position, quaternion, velocity, size in poses
     ]

@@ -19,6 +19,7 @@ from real2sim_proto.episode import AgentsSpec, IdmDriver, ResetSpec
 from real2sim_proto.plans import Control, TrajectoryPlan
 
 from ..edit import ObjectState, ScenarioState, compose, instances_of
+from ..edit.compose import lamps_on
 from ..geometry import transform_from
 from ..render.types import Instance
 from ..scene import Ground, Scene
@@ -49,7 +50,7 @@ from .plan import SinglePose, can_reverse, may_lead_backwards
 from .scoring import ScoringContext
 from .scoring.instant import ego_at_fault
 from .traffic.driver import Idm, desired_speed
-from .traffic.traffic import DRIVEN, MOVING
+from .traffic.traffic import BRAKING, DRIVEN, LAMPED, MOVING, STANDING
 from .world import World
 
 # --- Supported episodes --------------------------------------------------------------------------
@@ -242,9 +243,10 @@ class WorldInstances:
     """Render instances of W worlds.
 
     Attributes:
-        things: the background and N objects; ignore their own poses and times.
-        poses: [W, 1 + N, 4, 4] float64, ``T_world_object``.
-        there: [W, 1 + N] bool, whether each instance exists at the current time.
+        things: the background, N objects and the light of the B that may brake; ignore their own
+            poses and times.
+        poses: [W, 1 + N + B, 4, 4] float64, ``T_world_object``.
+        there: [W, 1 + N + B] bool, whether each instance exists at the current time.
         times_us: [W] int64, time for colours that change over time [us].
     """
 
@@ -313,6 +315,15 @@ class BatchWorld:
         self.objects, self._tracks = tracks_of(self.state, spec)
         self._rows = {o.object_id: k for k, o in enumerate(self.objects)}
         self._instances = instances_of(scene, self.state, self.objects)
+        self._lamped = self._tracks.driven & np.array(
+            [o.category in LAMPED for o in self.objects], np.bool_
+        )
+        self._braking = np.zeros((worlds, len(self.objects)), np.bool_)
+        if self._instances is not None:
+            self._instances += tuple(
+                lamps_on(scene, self.objects[k], self._instances[1 + k], ("brake",))
+                for k in np.flatnonzero(self._lamped).tolist()
+            )
         self._road = road_of(scene.ground, first.route, first.context)
         self._vehicle = tuple(vehicle_parameters(spec.ego))
         ego = spec.ego
@@ -408,6 +419,7 @@ class BatchWorld:
             self._near,
         )
         self._now, self._next = after, before
+        self._brake(going)
         self.steps[going] += 1
         if self.spec.ego.suspension is not None:
             seconds = self.spec.dt_us * 1e-6
@@ -444,7 +456,13 @@ class BatchWorld:
     def instances(self, w: int) -> list[Instance]:
         """Current render instances of one world; nothing is copied."""
         shown_us = min(int(self.times_us[w]), self.scene.end_us)
-        return compose(self.scene, self.state, self.agents(w), shown_us)
+        agents = self.agents(w)
+        drawn = compose(self.scene, self.state, agents, shown_us)
+        return drawn + [
+            lamps_on(self.scene, subject, drawn[k], ("brake",))
+            for k, subject in enumerate(agents.objects, start=1)
+            if self._braking[w, self._rows[subject.object_id]]
+        ]
 
     def shown(self, worlds: Sequence[int]) -> WorldInstances | None:
         """The :meth:`instances` of some worlds as arrays.
@@ -458,14 +476,28 @@ class BatchWorld:
         present = self._now.present[chosen]
         poses = np.empty((len(chosen), len(self._instances), 4, 4))
         poses[:, 0] = np.eye(4)
+        count = 1 + len(self.objects)
         quaternions = np.where(present[..., None], rows[..., 3:7], (1.0, 0.0, 0.0, 0.0))
-        poses[:, 1:] = transform_from(rows[..., :3], quaternions)
+        poses[:, 1:count] = transform_from(rows[..., :3], quaternions)
+        poses[:, count:] = poses[:, 1:count][:, self._lamped]
+        braking = self._braking[chosen][:, self._lamped]
         return WorldInstances(
             things=self._instances,
             poses=poses,
-            there=np.concatenate([np.ones((len(chosen), 1), np.bool_), present], axis=1),
+            there=np.concatenate([np.ones((len(chosen), 1), np.bool_), present, braking], axis=1),
             times_us=np.minimum(self.times_us[chosen], self.scene.end_us),
         )
+
+    def _brake(self, going: Flags) -> None:
+        """Update which driven vehicles show their brake lamps after a step."""
+        if not self._lamped.any():
+            return
+        now, last = self._now, self._next
+        speeds, before = (np.linalg.norm(i.objects[..., 7:], axis=2) for i in (now, last))
+        fell = np.where(last.drivers == DRIVES, before - speeds, 0.0)
+        slows = (speeds < STANDING) | (fell / (self.spec.dt_us * 1e-6) > BRAKING)
+        lit = slows & now.present & (now.drivers == DRIVES) & self._lamped
+        self._braking[going] = lit[going]
 
     def _begin(self, start_us: int | None) -> World:
         """The world at the start of an episode, cached by start time."""
@@ -497,6 +529,7 @@ class BatchWorld:
             k, idm = self._rows[object_id], cast(Idm, driver)
             now.drivers[w, k] = DRIVES if idm.present else LEFT
             now.driving[w, k] = idm.s, idm.offset, idm.speed
+        self._braking[w] = [o.object_id in world.lamps for o in self.objects]
         self.start_us[w], self.steps[w], self.horizons[w] = world.t_us, 0, world.horizon
         self.terminated[w] = self.truncated[w] = self.off_road[w] = False
         self.touching[w] = world.contacts.touching

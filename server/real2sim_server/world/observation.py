@@ -20,7 +20,7 @@ from ..edit.tracks import sample
 from ..scene import Scene
 from ..scene.lane import Lane
 from ..scene.lane_graph import LaneGraph
-from .agents import Agents, Event, agent_fields
+from .agents import Agents, Event, Lamps, agent_fields
 from .boxes import REAR_OVERHANG, headings
 from .collision.contact_state import StepContacts
 from .collision.sweep import StepStart
@@ -296,6 +296,7 @@ class Observation:
             the episode is privileged; else None.
         signals: traffic signals of the storyboard.
         lanes: map lanes near the ego; privileged episodes only.
+        lamps: lit lamps of the objects.
     """
 
     step: int
@@ -318,6 +319,7 @@ class Observation:
     truth: tuple[Motion, Float] | None = None
     signals: tuple[ShownSignal, ...] = ()
     lanes: tuple[LanePiece, ...] = ()
+    lamps: Lamps = field(default_factory=dict)
 
     def ego_fields(self) -> dict[str, Any]:
         """The wire's EgoState as a plain map."""
@@ -351,7 +353,7 @@ class Observation:
             "ego": self.ego_fields(),
             "command": self.command,
             "route": self.route,
-            "agents": agent_fields(self.agents) if self.agents is not None else [],
+            "agents": agent_fields(self.agents, self.lamps) if self.agents is not None else [],
             "events": [event.fields() for event in self.events],
             "metrics": dict(self.metrics),
             "terminated": self.terminated,

@@ -13,11 +13,12 @@ from real2sim_proto.episode import ResetSpec, SensorSpec
 from real2sim_proto.operations import Operation
 
 from ..edit import EditError, EditOutcome, ObjectState, ScenarioState, apply_operations, compose
+from ..edit.compose import lamps_on
 from ..edit.tracks import PackedTracks
 from ..render.types import Instance
 from ..scene import Scene
 from . import scoring
-from .agents import Agents, Event, Strides
+from .agents import Agents, Event, Lamps, Strides
 from .boxes import ego_box
 from .collision.bodies import Impact
 from .collision.contact import obstacle_grid
@@ -61,6 +62,7 @@ from .storyboard.program import ShownSignal
 from .storyboard.run import StoryboardRun, begin_storyboard
 from .traffic import ObservedEgo, Surroundings, Traffic
 from .traffic.spawner import begin_spawner
+from .traffic.traffic import lit_lamps
 
 OFF_ROUTE_DISTANCE = 10.0
 """Distance from the recorded path that triggers an event [m]; image quality drops beyond it."""
@@ -95,6 +97,7 @@ class World:
         ranging: LiDARs and radars of the episode.
         motion_history: motion of the ego and the objects, long enough for one sweep.
         strides: walking motion of pedestrians that have left their trajectories.
+        lamps: lit lamps of the objects.
     """
 
     def __init__(
@@ -143,6 +146,7 @@ class World:
         self._estimate_error = estimate_error(spec.randomization.estimate, self._draws, 0)
         self._controller = EgoController(spec, scene.ego)
         self.traffic = self._first_traffic(first)
+        self.lamps: Lamps = lit_lamps(self.traffic.drivers, {}, spec.dt_us * 1e-6)
         if first is not None:
             sampled |= dict(first.sampled)
         self._start_sampled = sampled
@@ -262,12 +266,13 @@ class World:
         controller, late_events = self._with_fallback(controller, missed=missed)
         reaction_events = self._update_reactive_agents()
         start = self._step_start(controller)
-        since_us, body = self.t_us, self.T_world_body
+        since_us, body, drivers = self.t_us, self.T_world_body, self.traffic.drivers
         moved = self._advance(controller)
         self._commit_motion(moved)
         self.strides = self.strides.after(
             self.scene, self.agents, since_us=since_us, t_us=self.t_us
         )
+        self.lamps = lit_lamps(self.traffic.drivers, drivers, (self.t_us - since_us) * 1e-6)
         spans = (body, self.T_world_body), (start.agents, self.agents)
         self.motion_history = self.motion_history.after(MotionSegment(since_us, self.t_us, *spans))
         self._step_sampled = _newly_sampled(self.traffic.sampled, sampled_before, jitter_us)
@@ -391,6 +396,7 @@ class World:
             truth=truth,
             signals=self._signals(),
             lanes=self._lanes_around(motion),
+            lamps=self.lamps,
         )
 
     def _signals(self) -> tuple[ShownSignal, ...]:
@@ -410,6 +416,13 @@ class World:
 
     def instances(self) -> list[Instance]:
         """The instances to render at this instant; nothing is copied."""
+        return self._drawn(moving=False)
+
+    def moving_instances(self) -> list[Instance]:
+        """Like :meth:`instances`, with object velocities, for motion blur and rolling shutter."""
+        return self._drawn(moving=True)
+
+    def _drawn(self, *, moving: bool) -> list[Instance]:
         shown_us = min(self.t_us, self.scene.end_us)
         strides = self.strides.made
         drawn = compose(self.scene, self.state, self.agents, shown_us, strides=strides)
@@ -420,15 +433,17 @@ class World:
                     subject.object_id, drawn[k], self.t_us
                 )
             drawn += self.deformation.fragments(self.t_us)
-        return drawn
-
-    def moving_instances(self) -> list[Instance]:
-        """Like :meth:`instances`, with object velocities, for motion blur and rolling shutter."""
-        drawn = self.instances()
-        for k, velocity in enumerate(self.agents.velocities, start=1):
-            twist = np.zeros(6)
-            twist[:3] = velocity
-            drawn[k] = replace(drawn[k], twist=twist)
+        if moving:
+            for k, velocity in enumerate(self.agents.velocities, start=1):
+                twist = np.zeros(6)
+                twist[:3] = velocity
+                drawn[k] = replace(drawn[k], twist=twist)
+        if self.lamps:
+            drawn += [
+                lamps_on(self.scene, subject, drawn[k], lit)
+                for k, subject in enumerate(self.agents.objects, start=1)
+                if (lit := self.lamps.get(subject.object_id))
+            ]
         return drawn
 
     @property

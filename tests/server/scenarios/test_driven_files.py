@@ -331,7 +331,10 @@ def test_nested_declarations_shadow_outer_ones(run):
 IGNORED = {
     "TrailerHitch": '<TrailerHitch dx="-1"/>',
     "ObjectController": '<ObjectController name="c"><Controller name="c"/></ObjectController>',
-    "AppearanceAction": """<AppearanceAction><LightStateAction><LightType/></LightStateAction>
+    "LightStateAction": """<AppearanceAction><LightStateAction><LightType><VehicleLight
+    vehicleLightType="lowBeam"/></LightType><LightState mode="on"/></LightStateAction>
+    </AppearanceAction>""",
+    "AnimationAction": """<AppearanceAction><AnimationAction><AnimationType/></AnimationAction>
     </AppearanceAction>""",
     "ActivateControllerAction": '<ActivateControllerAction lateral="true" longitudinal="true"/>',
     "ControllerAction": """<ControllerAction><AssignControllerAction/>

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from real2sim_proto.storyboard import Storyboard
+from real2sim_proto.storyboard import Storyboard, story_actions
 from real2sim_server.scenarios import ScenarioError
 from real2sim_server.scenarios.gallery import corner_case
 from real2sim_server.scenarios.openscenario import (
@@ -148,6 +148,40 @@ def test_files_from_another_program_mean_the_same(tmp_path):
     assert change.actions[0].action.lane == -2
     assert change.actions[0].action.dynamics.shape == "sinusoidal"
     assert change.start.groups[0].conditions[0].test.value == 1.0
+
+
+def test_lamps_are_read_back_as_written_and_other_lights_are_noted():
+    lights = [
+        {"kind": "light_state", "lamp": "brake"},
+        {"kind": "light_state", "lamp": "indicator_left", "mode": "flashing"},
+        {"kind": "light_state", "lamp": "indicator_right", "mode": "flashing", "on_time": 0.3},
+        {"kind": "light_state", "lamp": "hazard", "mode": "off"},
+    ]
+    fields = board(event("lamps", *lights), init=[("car", lights[1])])
+    fields["entities"] = [{**e, "box": fields["entities"][1]["box"]} for e in fields["entities"]]
+    written = Storyboard.model_validate(fields)
+    text = write_openscenario(written).decode()
+
+    again = read_openscenario_text(text.encode(), "case.xosc")
+    assert (again.board.init, again.board.stories) == (written.init, written.stories)
+    assert not again.notes
+
+    looks = text.replace("<LightStateAction>", '<LightStateAction transitionTime="0.2">')
+    looks = looks.replace(
+        'mode="on" />',
+        'mode="on" luminousIntensity="900"><Color colorType="red"><ColorRgb red="1" green="0" '
+        'blue="0" /></Color></LightState>',
+    )
+    noted = read_openscenario_text(looks.encode(), "case.xosc")
+    assert noted.board.stories == written.stories
+    assert [n.split(" is ignored")[0] for n in sorted(noted.notes)] == [
+        "<Color>", "luminousIntensity of <LightState>", "transitionTime of <LightStateAction>",
+    ]  # fmt: skip
+
+    fog = read_openscenario_text(text.replace("brakeLights", "fogLights").encode(), "case.xosc")
+    kinds = [action.kind for _, action in story_actions(fog.board)]
+    assert kinds == ["custom", "light_state", "light_state", "light_state"]
+    assert any("<LightStateAction> is ignored" in note for note in fog.notes)
 
 
 def test_curves_and_clearances_are_read_back_as_written():

@@ -47,6 +47,8 @@ def compare(batch: BatchWorld, w: int, world: World, at_fault: int) -> None:
     assert (world.terminated, world.truncated) == (batch.terminated[w], batch.truncated[w])
     assert world.accumulator.off_road == batch.off_road[w]
     assert world.contacts.touching == batch.touching[w]
+    ids = [i.instance_id for i in world.instances()]
+    assert sorted(i.instance_id for i in batch.instances(w)) == sorted(ids)
     assert sum(world.accumulator.at_fault.values()) == at_fault
 
 
@@ -126,6 +128,26 @@ def test_objects_appear_and_disappear_as_in_single_worlds(
     for default in ("log", "idm"):
         fields = {"action": "control", "agents": {"default": default}, "horizon": 40}
         drive_beside(scene, fields, worlds=3, steps=40)
+
+
+def test_brake_lamps_show_as_in_single_worlds(
+    make_scene: Callable[..., Scene], moving: Callable[..., Any]
+) -> None:
+    scene = make_scene(car=moving(14, speed=8.0), stands=moving(60))
+    spec, state = ResetSpec(action="control", agents={"default": "idm"}), ScenarioState.of(scene)
+    batch, world = BatchWorld(scene, spec, 1, state=state), World(scene, state, spec)
+    seen = []
+    for _ in range(50):
+        batch.step([[-4.0, 0.0]])
+        world.step(Control(acceleration=-4.0, steering=0.0))
+        shown = batch.shown([0])
+        assert shown is not None
+        lit = world.lamps == {"car": ("brake",)}
+        assert shown.there[0].tolist() == [True, True, True, lit]
+        assert len(world.instances()) == len(batch.instances(0)) == 3 + lit
+        seen.append(lit)
+    assert not seen[0]
+    assert seen[-1]
 
 
 def test_reset_restarts_only_the_selected_worlds(street: Scene) -> None:
@@ -208,8 +230,9 @@ def test_malformed_actions_are_refused(
         batch.step(actions, plan_us=plan_us)
 
 
-def test_shown_arrays_match_the_instances(street: Scene) -> None:
-    batch = BatchWorld(street, ResetSpec(action="control"), 2)
+@pytest.mark.parametrize("default", ["log", "idm"])
+def test_shown_arrays_match_the_instances(street: Scene, default: Any) -> None:
+    batch = BatchWorld(street, ResetSpec(action="control", agents={"default": default}), 2)
     batch.reset([1], start_us=[street.start_us + 3_000_000])
     shown = batch.shown([0, 1])
     assert shown is not None

@@ -196,6 +196,22 @@ def test_a_slow_leader_is_overtaken(driven, moving):
     assert world.accumulator.collisions == 0
 
 
+def test_the_left_indicator_flashes_during_a_change_to_the_left(driven, moving):
+    cars = {"lead": moving(40, 0, z=0.8, speed=4.0), "car": moving(0, 0, z=0.8, speed=10.0)}
+    drivers = {"lead": {"desired_speed": 4.0, "changes": False}, "car": {"desired_speed": 10.0}}
+    world = driven(TWO, drivers, **cars)
+    lit = []
+    for _ in range(150):
+        world.step(COAST)
+        lit.append("indicator_left" in world.lamps.get("car", ()))
+        assert "indicator_right" not in world.lamps.get("car", ())
+    first, change = lit.index(True), round(SPEC.change_time / 0.1)
+    assert lit[first : first + change] == ([True] * 4 + [False] * 5 + [True]) * (
+        change // 10 - 1
+    ) + ([True] * 4 + [False] * 6)
+    assert not any(lit[first + change :])
+
+
 def test_two_cars_do_not_swap_lanes_forever(driven, moving):
     """MOBIL also makes a slow leader change lanes for a fast follower."""
     cars = {"lead": moving(40, 0, z=0.8, speed=4.0), "car": moving(0, 0, z=0.8, speed=10.0)}

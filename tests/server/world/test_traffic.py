@@ -200,6 +200,33 @@ def test_a_cut_in_ends_ahead_in_the_egos_lane(driven):
     assert x - 2.0 - (world.motion.x + 3.65) == pytest.approx(8.0, abs=1.0)
 
 
+def lamps_of(world, object_id: str = "car") -> list:
+    return list(agent_of(world, object_id).get("lamps", ()))
+
+
+def test_brake_lamps_are_lit_while_a_driver_brakes_and_stands(driven):
+    world = driven("hard_brake", gap=25.0, delay=0.5, spec={"on_collision": "continue"})
+    lit = [lamps_of(world)]
+    for _ in range(20):
+        world.step(Control(acceleration=-8.0, steering=0.0))
+        lit.append(lamps_of(world))
+    assert lit == [[]] * 6 + [["brake"]] * 15
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_the_indicator_flashes_during_a_cut_in(driven, side):
+    world = driven("cut_in", gap=8.0, offset=3.5 * side, speed_change=0.0, duration=2.0)
+    lit = []
+    for _ in range(60):
+        world.step(COAST)
+        lit.append([lamp for lamp in lamps_of(world) if lamp != "brake"])
+    lamp = ["indicator_right" if side > 0 else "indicator_left"]
+    first = lit.index(lamp)
+    # It lasts 2 s, twice 0.5 s lit and 0.5 s dark.
+    assert lit[first : first + 19] == [lamp] * 4 + [[]] * 5 + [lamp] * 5 + [[]] * 5
+    assert not any(lit[first + 19 :])
+
+
 def test_an_ego_that_does_not_brake_hits_a_braking_cut_in(driven):
     world = driven("cut_in", gap=4.0, speed_change=-6.0)
     while not world.over:

@@ -466,6 +466,13 @@ VEHICLES = {
 }
 PEDESTRIANS = {"pedestrian": "pedestrian", "wheelchair": "pedestrian", "animal": "animal"}
 
+LAMPS = {
+    "brakeLights": "brake",
+    "indicatorLeft": "indicator_left",
+    "indicatorRight": "indicator_right",
+    "warningLights": "hazard",
+}
+
 
 def back(words: dict[str, str], word: str) -> str:
     """The first OpenSCENARIO word for a word of the storyboard."""

@@ -10,6 +10,7 @@ from .elements import (
     EDGES,
     ELEMENTS,
     FRAMES,
+    LAMPS,
     MEASURES,
     PLACES,
     RULES,
@@ -659,6 +660,31 @@ class Actions:
                 part.ignore_attribute(name, "images and traffic see what sensors see")
         return {"kind": "visibility", "visible": visible}
 
+    def _light_state(self, part: Part) -> Fields:
+        ignored = {"kind": "custom", "type": part.tag}
+        light = part.child("LightType").only({"VehicleLight", "UserDefinedLight"})
+        if light.tag == "UserDefinedLight":
+            part.ignore(ONLY_LAMPS)
+            return ignored
+        lamp = light.text("vehicleLightType")
+        if lamp not in LAMPS:
+            part.ignore(ONLY_LAMPS)
+            return ignored
+        state = part.child("LightState")
+        if part.number("transitionTime", 0.0) != 0.0:
+            part.ignore_attribute("transitionTime", "lamps change at once")
+        if "luminousIntensity" in state.raw.attributes:
+            state.ignore_attribute("luminousIntensity", "lamps have a brightness of their own")
+        if (colour := state.find("Color")) is not None:
+            colour.ignore("lamps have a colour of their own")
+        return {
+            "kind": "light_state",
+            "lamp": LAMPS[lamp],
+            "mode": state.choice("mode", {m: m for m in ("on", "off", "flashing")}),
+            "on_time": state.magnitude("flashingOnDuration", 0.5),
+            "off_time": state.magnitude("flashingOffDuration", 0.5),
+        }
+
     # --- global ---------------------------------------------------------------------------------
 
     def _environment(self, part: Part) -> Fields:
@@ -737,9 +763,10 @@ def _inline(part: Part) -> Part:
 _NESTED = frozenset(
     {
         "PrivateAction", "GlobalAction", "LongitudinalAction", "LateralAction", "RoutingAction",
-        "InfrastructureAction", "TrafficSignalAction",
+        "InfrastructureAction", "TrafficSignalAction", "AppearanceAction",
     }
 )  # fmt: skip
+ONLY_LAMPS = "images show brake lamps and indicators"
 CONTROLLERS = (
     "the planner drives the ego, and the actions of the file move all others; controllers of other "
     "programs do not run"
@@ -749,7 +776,7 @@ _WITHOUT_EFFECT = {
     "ActivateControllerAction": CONTROLLERS,
     "AssignControllerAction": CONTROLLERS,
     "OverrideControllerValueAction": CONTROLLERS,
-    "AppearanceAction": "lamps and animations are not shown",
+    "AnimationAction": "animations are not shown",
     "TrailerAction": "trailers are not simulated",
     "UserDefinedAction": "it is for another program",
 }
@@ -767,6 +794,7 @@ _ACTIONS: dict[str, Any] = {
     "AcquirePositionAction": Actions._acquire_position,
     "TeleportAction": Actions._teleport,
     "VisibilityAction": Actions._visibility,
+    "LightStateAction": Actions._light_state,
     "EntityAction": Actions._entity,
     "EnvironmentAction": Actions._environment,
     "TrafficSignalStateAction": Actions._signal_state,

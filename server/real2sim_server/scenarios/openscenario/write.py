@@ -14,6 +14,7 @@ from .elements import (
     EDGES,
     ELEMENTS,
     FRAMES,
+    LAMPS,
     MEASURES,
     PLACES,
     PRIORITIES,
@@ -301,6 +302,15 @@ def _visibility(parent: Element, a: Mapping[str, Any]) -> None:
     _add(parent, "VisibilityAction", graphics=shown, sensors=shown, traffic=shown)
 
 
+def _light_state(parent: Element, a: Mapping[str, Any]) -> None:
+    part = _add(_add(parent, "AppearanceAction"), "LightStateAction")
+    _add(_add(part, "LightType"), "VehicleLight", vehicleLightType=back(LAMPS, a["lamp"]))
+    flashing = a["mode"] == "flashing" or (a["on_time"], a["off_time"]) != (0.5, 0.5)
+    _add(part, "LightState", mode=a["mode"],
+         flashingOnDuration=a["on_time"] if flashing else None,
+         flashingOffDuration=a["off_time"] if flashing else None)  # fmt: skip
+
+
 def _controller(parent: Element, a: Mapping[str, Any]) -> None:
     raise _wordless("a controller's parameters")
 
@@ -350,6 +360,7 @@ _WRITE = {
     "acquire_position": _acquire_position,
     "teleport": _teleport,
     "visibility": _visibility,
+    "light_state": _light_state,
     "controller": _controller,
     "add_entity": _add_entity,
     "delete_entity": _delete_entity,

@@ -435,7 +435,7 @@ def session_state(session_id: str, world: World, events: Iterable[Event]) -> Ses
             "t_us": world.t_us,
             "revision": world.revision,
             "ego": ego_fields(world.motion, world.T_world_vehicle, world.scene.ego_size),
-            "agents": agent_fields(world.agents),
+            "agents": agent_fields(world.agents, world.lamps),
             "events": [event.fields() for event in events],
             "metrics": seen.metrics,
             "terminated": world.terminated,

@@ -18,6 +18,7 @@ from real2sim_proto.storyboard_actions import (
     LaneChangeAction,
     LaneOffsetAction,
     LateralDistanceAction,
+    LightStateAction,
     LongitudinalDistanceAction,
     SpeedAction,
     SpeedLimits,
@@ -361,6 +362,10 @@ def _visibility(actor: EntityState, action: VisibilityAction, at: Beginning) -> 
     return _done(actor, at, visible=action.visible)
 
 
+def _light_state(actor: EntityState, action: LightStateAction, at: Beginning) -> EntityState:
+    return _done(actor, at, lights={**actor.lights, action.lamp: (action, at.view.elapsed)})
+
+
 def _controller(actor: EntityState, action: ControllerAction, at: Beginning) -> EntityState:
     actor = _freed(actor)
     if not action.active:
@@ -387,5 +392,6 @@ _BEGIN: Mapping[type[Any], Callable[[EntityState, Any, Beginning], EntityState]]
     AcquirePositionAction: _acquire_position,
     TeleportAction: _teleport,
     VisibilityAction: _visibility,
+    LightStateAction: _light_state,
     ControllerAction: _controller,
 }

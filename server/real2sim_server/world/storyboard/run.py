@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from real2sim_proto import ErrorCode
+from real2sim_proto.drive import Lamp
 from real2sim_proto.episode import ResetSpec
 from real2sim_proto.storyboard import (
     DRAWN,
@@ -25,7 +26,7 @@ from real2sim_proto.storyboard import (
     Uniform,
     resolved,
 )
-from real2sim_proto.storyboard_actions import SpeedLimits
+from real2sim_proto.storyboard_actions import LightStateAction, SpeedLimits
 
 from ...edit import ObjectState, ScenarioState
 from ...edit.compose import figure_of
@@ -430,11 +431,31 @@ class StoryboardRun:
 
     def _with_drivers(self, surroundings: Surroundings) -> StoryboardRun:
         drivers = {
-            a.subject.object_id: ScriptedEntity(a.subject, a.pose(surroundings.ground), a.visible)
+            a.subject.object_id: ScriptedEntity(
+                a.subject, a.pose(surroundings.ground), a.visible, _lit(a, self.elapsed)
+            )
             for a in self.entities.values()
             if a.subject is not None
         }
         return copy_with(self, drivers=MappingProxyType(drivers))
+
+
+def _lit(actor: EntityState, elapsed: float) -> tuple[Lamp, ...]:
+    """The lamps of an entity that are lit at a time [s]."""
+    lit = {
+        lamp for lamp, (action, since) in actor.lights.items() if _is_lit(action, elapsed - since)
+    }
+    indicators: tuple[Lamp, ...] = ("indicator_left", "indicator_right")
+    brake: tuple[Lamp, ...] = ("brake",) if "brake" in lit else ()
+    return *brake, *(lamp for lamp in indicators if lamp in lit or "hazard" in lit)
+
+
+def _is_lit(action: LightStateAction, since: float) -> bool:
+    # In whole microseconds: 0.7 - 0.2 is less than 0.5.
+    on_us, off_us = (round(float(t) * 1e6) for t in (action.on_time, action.off_time))
+    if action.mode != "flashing" or not off_us:
+        return action.mode != "off"
+    return round(since * 1e6) % (on_us + off_us) < on_us
 
 
 def _resolved(board: Storyboard) -> Storyboard:

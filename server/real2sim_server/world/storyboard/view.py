@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, Protocol
 from real2sim_proto import ErrorCode
 from real2sim_proto.storyboard_actions import (
     LanePosition,
+    LightStateAction,
     Orientation,
     Position,
     RelativeLanePosition,
@@ -98,6 +99,7 @@ class EntityState:
         trajectory: trajectory that it follows instead of its path, or None.
         finished: tokens of finished actions.
         performance: limits of its speed and acceleration.
+        lights: the last action on each lamp, and when it started [s].
     """
 
     name: str
@@ -125,6 +127,7 @@ class EntityState:
     trajectory: Trajectory | None = None
     finished: frozenset[int] = frozenset()
     performance: SpeedLimits = field(default_factory=SpeedLimits)
+    lights: Mapping[str, tuple[LightStateAction, float]] = field(default_factory=dict)
 
     @property
     def middle(self) -> tuple[float, float]:

@@ -10,6 +10,7 @@ from typing import NamedTuple, Protocol, Self
 
 import numpy as np
 
+from real2sim_proto.drive import Lamp
 from real2sim_proto.episode import (
     ConstantVelocityDriver,
     ExternalDriver,
@@ -352,11 +353,13 @@ class ScriptedEntity:
 
     Attributes:
         subject, pose, present: see :class:`~.driver.AgentDriver`.
+        lamps: its lit lamps.
     """
 
     subject: ObjectState
     pose: AgentPose
     present: bool = True
+    lamps: tuple[Lamp, ...] = ()
 
     def advance(self, surroundings: Surroundings) -> Self:
         """Returns itself; its storyboard creates the next one."""

@@ -128,6 +128,8 @@ MIN_CHANGE_SPEED = 3.0
 DECIDES_EVERY = 1.0
 """Interval between lane change decisions [s]. Drivers decide at different phases, because two that
 always decide at once would yield to each other forever."""
+TINY = 1e-6
+"""Rounding of times that are sums of steps [s]."""
 RENEWED = 200.0
 """Remaining length at which the lane chain is extended [m]."""
 
@@ -179,6 +181,13 @@ class LaneChanger:
         vx, vy, _ = now.velocity
         speed = max(vx * math.cos(near.yaw) + vy * math.sin(near.yaw), 0.0)
         return cls(subject, spec, way, near.s, near.offset, speed, now)
+
+    @property
+    def turning(self) -> tuple[float, float] | None:
+        """The current lane change, as ``changing``."""
+        if self.changing is None or self.changing[1] > self.spec.change_time - TINY:
+            return None
+        return self.changing
 
     @property
     def aim(self) -> tuple[float, float]:
@@ -366,6 +375,13 @@ class CutIn:
         speed = surroundings.ego.speed
         pose = _on_route(surroundings, subject, (s, spec.offset), (speed, 0.0))
         return cls(subject, spec, s, spec.offset, speed, pose)
+
+    @property
+    def turning(self) -> tuple[float, float] | None:
+        """Offset at the start of the cut-in [m], and time since then [s]; None before and after."""
+        if self.began is None or self.began[2] > self.spec.duration - TINY:
+            return None
+        return self.began[0], self.began[2]
 
     def advance(self, surroundings: Surroundings) -> Self:
         """The driver one step later."""

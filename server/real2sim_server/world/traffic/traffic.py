@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
@@ -10,6 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from real2sim_proto import ErrorCode
+from real2sim_proto.drive import Lamp
 from real2sim_proto.episode import AgentDriver as DriverSpec
 from real2sim_proto.episode import (
     AgentsSpec,
@@ -26,7 +28,7 @@ from real2sim_proto.episode import (
 from ...edit import ObjectState
 from ...edit.tracks import PackedTracks
 from ...geometry import transform_from
-from ..agents import Agents, rows_of
+from ..agents import Agents, Lamps, rows_of
 from ..common import WorldError, copy_with
 from ..path import Float
 from .driver import (
@@ -73,6 +75,21 @@ DRIVEN = frozenset({"car", "vehicle", "van", "truck", "bus", "motorcycle", "cycl
 
 SCRIPTED = (Replay, ConstantVelocity, Idm, LaneChanger, CutIn, HardBrake, JunctionCrossing)
 """Drivers that need no external input."""
+
+USING_LAMPS = (ConstantVelocity, Idm, LaneChanger, CutIn, HardBrake, JunctionCrossing, External)
+"""Drivers that show lamps by their motion."""
+
+LAMPED = DRIVEN - {"cyclist"}
+"""Categories whose drivers use lamps."""
+
+BRAKING = 1.0
+"""Deceleration above which the brake lamps of a driven vehicle are lit [m/s^2]."""
+
+STANDING = 0.1
+"""Speed below which they are lit too [m/s]."""
+
+FLASH_US = 500_000
+"""Time for which the indicators of a driven vehicle are lit, and then dark [us]."""
 
 NOTHING_SAMPLED: Mapping[str, float] = MappingProxyType({})
 
@@ -366,6 +383,43 @@ class Traffic:
         if kind == "lanes":
             return LaneDriver()
         return IdmDriver() if kind == "idm" else ConstantVelocityDriver()
+
+
+def lit_lamps(
+    drivers: Mapping[str, AgentDriver], before: Mapping[str, AgentDriver], dt: float
+) -> Lamps:
+    """Lit lamps of all objects with drivers.
+
+    Objects that repeat the recording or have been hit have none.
+
+    Args:
+        drivers: current drivers by id.
+        before: drivers one step earlier; empty at the start.
+        dt: the time step [s].
+    """
+    found = dict[str, tuple[Lamp, ...]]()
+    for object_id, driver in drivers.items():
+        if isinstance(driver, ScriptedEntity):
+            lit = driver.lamps
+        elif isinstance(driver, USING_LAMPS) and driver.subject.category in LAMPED:
+            lit = _lamps_of(driver, before.get(object_id), dt)
+        else:
+            continue
+        if lit:
+            found[object_id] = lit
+    return found
+
+
+def _lamps_of(driver: AgentDriver, before: AgentDriver | None, dt: float) -> tuple[Lamp, ...]:
+    lit = list[Lamp]()
+    speed = math.hypot(*driver.pose.velocity)
+    fell = 0.0 if before is None else math.hypot(*before.pose.velocity) - speed
+    if speed < STANDING or fell / dt > BRAKING:
+        lit.append("brake")
+    turning = driver.turning if isinstance(driver, LaneChanger | CutIn) else None
+    if turning is not None and round(turning[1] * 1e6) % (2 * FLASH_US) < FLASH_US:
+        lit.append("indicator_right" if turning[0] > 0 else "indicator_left")
+    return tuple(lit)
 
 
 def _check_lanes(spec: AgentsSpec, surroundings: Surroundings) -> None:

@@ -79,13 +79,13 @@ def test_an_unsupported_element_is_refused_with_its_line(client, url):
 
 
 def test_an_element_without_effect_is_noted_or_refused_if_strict(client, url):
-    text = FILE.decode().replace("LongitudinalAction>", "AppearanceAction>").encode()
+    text = FILE.decode().replace("LongitudinalAction>", "TrailerAction>").encode()
     path = f"{url}/storyboard.xosc"
     strict = client.put(path, params={"strict": True}, content=text, headers=XOSC)
     noted = client.put(path, content=text, headers=XOSC)
 
-    assert "<AppearanceAction> is not supported" in strict.json()["detail"]
-    assert any("<AppearanceAction> is ignored" in note for note in noted.json()["notes"])
+    assert "<TrailerAction> is not supported" in strict.json()["detail"]
+    assert any("<TrailerAction> is ignored" in note for note in noted.json()["notes"])
 
 
 def test_unknown_storyboards_cases_and_parameters_are_refused(client, url):

@@ -7,6 +7,9 @@ import math
 import numpy as np
 import pytest
 
+from real2sim_server.render import rasterize
+from real2sim_server.render.images import to_uint8
+from real2sim_server.scene import Camera
 from real2sim_server.world.storyboard.roads import Place, path_through
 
 from .boards import action_at, after, board, drive, event, places, speeds
@@ -313,6 +316,81 @@ def test_an_entity_appears_where_it_is_put_and_leaves(run):
 
     assert "car" in {o.object_id for o in worlds[5].agents.objects}
     assert "car" not in {o.object_id for o in worlds[15].agents.objects}
+
+
+def light(lamp, mode="on", **times):
+    return {"kind": "light_state", "lamp": lamp, "mode": mode, **times}
+
+
+def lamps_of(worlds):
+    return [w.lamps.get("car", ()) for w in worlds]
+
+
+def test_lamps_are_lit_until_they_are_switched_off(run):
+    on, off = light("brake"), light("brake", "off")
+    lit = lamps_of(run(action_at(1.0, on), action_at(1.5, off), steps=20))
+
+    assert lit == [()] * 11 + [("brake",)] * 5 + [()] * 5
+
+
+def test_a_lamp_flashes_with_its_times(run):
+    flash = light("indicator_left", "flashing", on_time=0.3, off_time=0.2)
+    lit = lamps_of(run(init=[("car", flash)], steps=20))
+
+    lamp = ("indicator_left",)
+    assert lit == ([lamp] * 3 + [()] * 2) * 4 + [lamp]
+
+
+def test_the_hazard_lamps_leave_the_indicators_their_state(run):
+    lit = lamps_of(
+        run(
+            action_at(0.5, light("hazard")),
+            action_at(1.0, light("hazard", "off")),
+            init=[("car", light("indicator_right"))],
+            steps=15,
+        )
+    )
+    both = ("indicator_left", "indicator_right")
+    assert lit == [both[1:]] * 6 + [both] * 5 + [both[1:]] * 5
+
+
+@pytest.mark.parametrize(
+    ("lamp", "corners", "colour"),
+    [
+        ("brake", [(-2.33, 0.645), (-2.33, -0.645)], (255, 115, 89)),
+        ("indicator_left", [(-2.33, 0.805), (2.33, 0.805)], (255, 204, 89)),
+        ("indicator_right", [(-2.33, -0.805), (2.33, -0.805)], (255, 204, 89)),
+    ],
+)
+def test_lit_lamps_show_at_corners_of_the_car_and_nowhere_else(run, lamp, corners, colour):
+    """The car is 8 m ahead of the camera; its lamps are 0.825 m above the ground."""
+    K = np.array([[400.0, 0, 160], [0, 400, 100], [0, 0, 1]])
+    mount = np.array([[0, 0, 1, 1.5], [-1, 0, 0, 0], [0, -1, 0, 1.2], [0, 0, 0, 1]], np.float64)
+    camera = Camera("ahead", 320, 200, K, mount)
+
+    def shown(*init):
+        place = {"kind": "relative_lane", "entity": "Ego", "ds": 11.8}
+        put = ("car", {"kind": "teleport", "position": place})
+        (world,) = run(init=[put, *init], steps=0)
+        view = camera.viewmat(world.T_world_body)
+        drawn = rasterize(world.instances(), view[None], K[None], 320, 200, backend="reference")
+        return world, view, to_uint8(drawn.rgb)[0].astype(int)
+
+    _, _, dark = shown()
+    world, view, lit = shown(("car", light(lamp)))
+
+    (T_world_car,) = (
+        T for o, T in zip(world.agents.objects, world.agents.transforms, strict=True)
+        if o.object_id == "car"
+    )  # fmt: skip
+    places = np.array([view @ T_world_car @ (x, y, 0.825 - 0.75, 1.0) for x, y in corners])
+    pixels = places[:, :2] / places[:, 2:3] * 400.0 + (160, 100)
+    assert lit[int(pixels[0, 1]), int(pixels[0, 0])] == pytest.approx(colour, abs=25)
+    changed = np.argwhere((lit != dark).any(axis=2))[:, ::-1] + 0.5
+    away = np.abs(changed[:, None] - pixels).max(axis=2)
+    # A lamp is at most 0.5 m wide and high.
+    assert len(changed) > 20
+    assert (away < 0.25 * 400.0 / places[:, 2]).any(axis=1).all()
 
 
 def test_a_controller_brakes_behind_the_ego(run):
