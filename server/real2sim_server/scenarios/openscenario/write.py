@@ -10,6 +10,7 @@ from real2sim_proto.storyboard import MapRoads, Storyboard
 
 from .. import ScenarioError
 from .elements import (
+    CARLA,
     DIMENSIONS,
     EDGES,
     ELEMENTS,
@@ -74,6 +75,11 @@ def _check(board: Storyboard) -> None:
             raise _wordless(f"entity {entity.name!r} is bound to an object or asset of a scene")
         if entity.box is None:
             raise _wordless(f"entity {entity.name!r} has no box; give it one")
+    if board.name.startswith(CARLA):
+        raise ScenarioError(
+            f"the storyboard's name {board.name!r} begins with {CARLA!r}, which marks files with "
+            "left-handed coordinates; rename it"
+        )
     if board.distributions:
         raise _wordless("distributions belong in a separate file; leave them out")
 
