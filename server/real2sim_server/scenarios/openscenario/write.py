@@ -75,6 +75,10 @@ def _check(board: Storyboard) -> None:
             raise _wordless(f"entity {entity.name!r} is bound to an object or asset of a scene")
         if entity.box is None:
             raise _wordless(f"entity {entity.name!r} has no box; give it one")
+    if board.map_signals is not None:
+        raise _wordless(
+            "map_signals; leave it out, or list the map's lights in signals and controllers"
+        )
     if board.name.startswith(CARLA):
         raise ScenarioError(
             f"the storyboard's name {board.name!r} begins with {CARLA!r}, which marks files with "
