@@ -406,6 +406,12 @@ class AssignRouteAction(Model):
     route: Route
 
 
+class RandomRouteAction(Model):
+    """Sets a route along lanes that is random at each fork, sampled with the episode's seed."""
+
+    kind: Literal["random_route"] = "random_route"
+
+
 class AcquirePositionAction(Model):
     """Drives along lanes to a position."""
 
@@ -465,6 +471,7 @@ PrivateAction = Annotated[
     | SynchronizeAction
     | FollowTrajectoryAction
     | AssignRouteAction
+    | RandomRouteAction
     | AcquirePositionAction
     | TeleportAction
     | VisibilityAction
@@ -541,6 +548,7 @@ AnyAction = Annotated[
     | SynchronizeAction
     | FollowTrajectoryAction
     | AssignRouteAction
+    | RandomRouteAction
     | AcquirePositionAction
     | TeleportAction
     | VisibilityAction

@@ -238,3 +238,12 @@ def test_offsets_in_left_lanes_of_carla_are_to_the_right_of_the_traffic():
 def test_a_name_that_marks_the_coordinates_of_carla_is_not_written():
     with pytest.raises(ScenarioError, match="rename it"):
         write_openscenario(Storyboard(name="CARLA:case"))
+
+
+def test_a_random_route_is_read_and_written():
+    route = "<RoutingAction><RandomRouteAction /></RoutingAction>"
+    at = CASE.index("</Private>")
+    found = read(f"{CASE[:at]}<PrivateAction>{route}</PrivateAction>{CASE[at:]}")
+
+    assert "random_route" in [entry.action.kind for entry in found.init]
+    assert read(write_openscenario(found).decode()) == found

@@ -663,6 +663,9 @@ class Actions:
     def _assign_route(self, part: Part) -> Fields:
         return {"kind": "assign_route", "route": self._positions.route(part)}
 
+    def _random_route(self, _part: Part) -> Fields:
+        return {"kind": "random_route"}
+
     def _acquire_position(self, part: Part) -> Fields:
         place = self._positions.position(part.child("Position"))
         return {"kind": "acquire_position", "position": place}
@@ -782,6 +785,7 @@ _ACTIONS: dict[str, Any] = {
     "SynchronizeAction": Actions._synchronize,
     "FollowTrajectoryAction": Actions._follow_trajectory,
     "AssignRouteAction": Actions._assign_route,
+    "RandomRouteAction": Actions._random_route,
     "AcquirePositionAction": Actions._acquire_position,
     "TeleportAction": Actions._teleport,
     "VisibilityAction": Actions._visibility,

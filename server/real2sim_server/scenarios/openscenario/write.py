@@ -297,6 +297,10 @@ def _assign_route(parent: Element, a: Mapping[str, Any]) -> None:
     _route(_add(_add(parent, "RoutingAction"), "AssignRouteAction"), a["route"])
 
 
+def _random_route(parent: Element, _a: Mapping[str, Any]) -> None:
+    _add(_add(parent, "RoutingAction"), "RandomRouteAction")
+
+
 def _acquire_position(parent: Element, a: Mapping[str, Any]) -> None:
     part = _add(_add(parent, "RoutingAction"), "AcquirePositionAction")
     _position(_add(part, "Position"), a["position"])
@@ -357,6 +361,7 @@ _WRITE = {
     "synchronize": _synchronize,
     "follow_trajectory": _follow_trajectory,
     "assign_route": _assign_route,
+    "random_route": _random_route,
     "acquire_position": _acquire_position,
     "teleport": _teleport,
     "visibility": _visibility,

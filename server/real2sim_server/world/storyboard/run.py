@@ -550,13 +550,13 @@ def begin_storyboard(
         subjects_of(resolved(board).entities, state, scene),
         surroundings,
         ego_size=scene.ego_size,
-        network=_network(board, scene),
+        network=_network(board, scene, draws),
         draws=draws,
         lanes=_lights(board, scene),
     )
 
 
-def _network(board: Storyboard, scene: Scene) -> RoadNetwork | None:
+def _network(board: Storyboard, scene: Scene, draws: Draws) -> RoadNetwork | None:
     """Road network of the scene's map if the storyboard uses one; None for route lanes."""
     if not isinstance(board.roads, MapRoads):
         return None
@@ -569,7 +569,7 @@ def _network(board: Storyboard, scene: Scene) -> RoadNetwork | None:
             hint="run it on a scene made from that network, or with storyboard.roads of kind "
             "'route', lanes along the ego's route",
         )
-    return GraphNetwork(graph)
+    return GraphNetwork(graph, draws)
 
 
 def _lights(board: Storyboard, scene: Scene) -> LaneGraph | None:
