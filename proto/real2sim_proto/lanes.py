@@ -62,6 +62,7 @@ class SignalInfo(_Part):
     lanes: list[str] = Field(default_factory=list)
     stop_line: str | None = Field(default=None, description="null: at the lanes' ends")
     value: float | None = Field(default=None, description="speed limit [m/s]")
+    group: str | None = Field(default=None, description="the map's controller of a traffic light")
 
 
 class RoadLaneInfo(_Part):

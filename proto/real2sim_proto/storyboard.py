@@ -152,6 +152,19 @@ class SignalController(Model):
     phases: list[Phase] = Field(min_length=1, max_length=200)
 
 
+class MapSignals(Model):
+    """Cycle of the traffic lights of each junction of the scene's map.
+
+    One group of lights after the other is green, then yellow; then all are red. Lights of the same
+    or opposite directions, within 30 degrees, form a group, unless the map has different
+    controllers for them. All cycles begin with the episode.
+    """
+
+    green: Value = Field(default=20.0, description="[s]")
+    yellow: Value = Field(default=3.0, description="[s]")
+    clearance: Value = Field(default=2.0, description="time in which all lights are red [s]")
+
+
 # --- story ------------------------------------------------------------------------------------
 
 
@@ -323,6 +336,13 @@ class Storyboard(Model):
     entities: list[Entity] = Field(default_factory=list, max_length=MAX_ENTITIES)
     signals: list[SignalHead] = Field(default_factory=list, max_length=1000)
     controllers: list[SignalController] = Field(default_factory=list, max_length=200)
+    map_signals: MapSignals | None = Field(
+        default=None,
+        description=(
+            "cycle of the map's traffic lights that `signals` and `controllers` do not name; None: "
+            "they have no states"
+        ),
+    )
     init: list[InitAction] = Field(default_factory=list, max_length=1000)
     global_init: list[GlobalAction] = Field(default_factory=list, max_length=1000)
     stories: list[Story] = Field(default_factory=list, max_length=100)
@@ -341,7 +361,7 @@ class Storyboard(Model):
     def _names_are_known(self) -> Storyboard:
         _check_names(self)
         board = resolved(self)
-        for part in (board.controllers, board.init, board.stories, board.stop):
+        for part in (board.controllers, board.map_signals, board.init, board.stories, board.stop):
             _check_magnitudes(part, "")
         return self
 
@@ -362,7 +382,7 @@ def resolved(board: Storyboard) -> Storyboard:
 
 
 _RESOLVED = (
-    "entities", "signals", "controllers", "init", "global_init", "stories", "stop",
+    "entities", "signals", "controllers", "map_signals", "init", "global_init", "stories", "stop",
 )  # fmt: skip
 
 
@@ -459,6 +479,7 @@ _NEVER_NEGATIVE: Mapping[type[Model], tuple[str, ...]] = {
     Offroad: ("duration",),
     EndOfRoad: ("duration",),
     Phase: ("duration",),
+    MapSignals: ("green", "yellow", "clearance"),
 }
 """Times and distances by model."""
 
@@ -470,6 +491,7 @@ def _check_magnitudes(part: Any, where: str) -> None:
     if not isinstance(part, Model):
         return
     own = part.entity if isinstance(part, InitAction) else getattr(part, "name", "")
+    own = "map_signals" if isinstance(part, MapSignals) else own
     where = "::".join(name for name in (where, own) if name)
     members = {name: name for name in _NEVER_NEGATIVE.get(type(part), ())}
     if isinstance(part, Dynamics) and part.shape != "step" and part.dimension != "rate":
@@ -500,6 +522,7 @@ __all__ = [
     "Maneuver",
     "ManeuverGroup",
     "MapRoads",
+    "MapSignals",
     "Phase",
     "RouteLanes",
     "SignalController",

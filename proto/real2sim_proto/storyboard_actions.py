@@ -406,6 +406,12 @@ class AssignRouteAction(Model):
     route: Route
 
 
+class RandomRouteAction(Model):
+    """Sets a route along lanes that is random at each fork, sampled with the episode's seed."""
+
+    kind: Literal["random_route"] = "random_route"
+
+
 class AcquirePositionAction(Model):
     """Drives along lanes to a position."""
 
@@ -477,6 +483,7 @@ PrivateAction = Annotated[
     | SynchronizeAction
     | FollowTrajectoryAction
     | AssignRouteAction
+    | RandomRouteAction
     | AcquirePositionAction
     | TeleportAction
     | VisibilityAction
@@ -554,6 +561,7 @@ AnyAction = Annotated[
     | SynchronizeAction
     | FollowTrajectoryAction
     | AssignRouteAction
+    | RandomRouteAction
     | AcquirePositionAction
     | TeleportAction
     | VisibilityAction

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import xml.etree.ElementTree as ET
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -214,6 +214,25 @@ def read_signals(
     return [_with_stop_line(s, stop_lines) for s in signals.values()], list(stop_lines.values())
 
 
+def read_controllers(
+    root: ET.Element, signals: Collection[str], left_out: Mapping[str, list[str]]
+) -> dict[str, str]:
+    """The controller of each controlled signal, the first one in the file.
+
+    ``left_out`` receives the controlled signals that are not there.
+    """
+    found: dict[str, str] = {}
+    for controller in root.findall("controller"):
+        name = controller.get("id", "")
+        for control in controller.findall("control"):
+            signal = control.get("signalId", "")
+            if signal in signals:
+                found.setdefault(signal, name)
+            else:
+                left_out["controlled signals that are not there"].append(f"{signal} of {name}")
+    return found
+
+
 def _ruled(element: ET.Element, road: OpenDriveRoad, line: Road, file: str) -> tuple[str, ...]:
     where = f"{file}: signal {element.get('id', '')!r}"
     s = min(max(number(element, "s", where), 0.0), line.length)
@@ -277,8 +296,9 @@ def _signal(
 
 
 def _kind(element: ET.Element) -> SignalKind:
-    given = element.get("type", "")
-    if element.get("dynamic", "no") == "yes" or given.startswith(LIGHT_TYPES):
+    given, dynamic = element.get("type", ""), element.get("dynamic")
+    # Marks on the road, such as those of crosswalks, have similar types but are not dynamic.
+    if dynamic == "yes" or (dynamic != "no" and given.startswith(LIGHT_TYPES)):
         return "traffic_light"
     if given in STOP_TYPES:
         return "stop"
@@ -430,11 +450,12 @@ class _Build:
         found = self._joined(self._beside(found))
         lines = {k: self._with_lanes(k, found) for k, road in self.lines.items()}
         signals, stop_lines = read_signals(self.roads, lines, self.file, self.left_out)
+        groups = read_controllers(self.root, {s.signal_id for s in signals}, self.left_out)
         return LaneGraph.of(
             found.values(),
             areas=read_crossings(self.roads, lines, self.file),
             stop_lines=stop_lines,
-            signals=signals,
+            signals=[replace(s, group=groups.get(s.signal_id)) for s in signals],
             roads=lines.values(),
             source=f"opendrive {name}",
             geo_reference=_geo_reference(self.root, self.file),

@@ -405,6 +405,7 @@ class Signal:
         lanes: controlled lanes.
         stop_line: stop line of their traffic; None for the ends of the lanes.
         value: value of a speed limit [m/s], else None.
+        group: the map's controller of a traffic light, or None.
     """
 
     signal_id: str
@@ -414,6 +415,7 @@ class Signal:
     lanes: tuple[str, ...] = ()
     stop_line: str | None = None
     value: float | None = None
+    group: str | None = None
 
     def __post_init__(self) -> None:
         what = f"signal {self.signal_id!r}"
@@ -424,6 +426,15 @@ class Signal:
             raise SceneError(f"{what}: holds a number that is not finite")
         object.__setattr__(self, "position", tuple(float(v) for v in self.position))
         object.__setattr__(self, "lanes", tuple(dict.fromkeys(self.lanes)))
+
+
+class StopLineAt(NamedTuple):
+    """A stop line: centre [m] and heading of traffic [rad], world frame; half its width [m]."""
+
+    x: float
+    y: float
+    heading: float
+    half: float
 
 
 def points_of(values: ArrayLike, what: str, *, least: int = 2) -> Float:

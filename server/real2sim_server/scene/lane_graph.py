@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import heapq
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
@@ -16,7 +16,18 @@ from numpy.typing import ArrayLike, NDArray
 from .._numba import func, kernel
 from ..geometry import Float
 from .errors import SceneError
-from .lane import DRIVABLE, TRAVELLED, Area, Lane, LanePlace, Road, Signal, StopLine, turned
+from .lane import (
+    DRIVABLE,
+    TRAVELLED,
+    Area,
+    Lane,
+    LanePlace,
+    Road,
+    Signal,
+    StopLine,
+    StopLineAt,
+    turned,
+)
 
 # Kernels: lanes near a position.
 
@@ -380,8 +391,8 @@ class LaneGraph:
                 found[name].append(lane.lane_id)
         return {name: tuple(before) for name, before in found.items()}
 
-    def straightest(self, lanes: Iterable[Lane], *, forwards: bool = True) -> Lane:
-        """The lane that turns least; of equal ones, that to the side on which traffic drives."""
+    def straightest_first(self, lanes: Iterable[Lane], *, forwards: bool = True) -> list[Lane]:
+        """Lanes by how far they turn; of equal ones, that to the side on which traffic drives."""
 
         def order(lane: Lane) -> tuple[float, float, str]:
             left = lane.turn if forwards else -lane.turn
@@ -389,7 +400,36 @@ class LaneGraph:
             right = place is None or self.road(place[0]).drives_right
             return round(abs(left), 6), left if right else -left, lane.lane_id
 
-        return min(lanes, key=order)
+        return sorted(lanes, key=order)
+
+    @cached_property
+    def stops(self) -> Mapping[str, tuple[StopLineAt, ...]]:
+        """Where the traffic of each signal stops, by the signal's id.
+
+        Without a stop line, at the ends of its lanes, or at the starts of those in a junction.
+        """
+        return {name: tuple(self._stops_of(signal)) for name, signal in self.signals.items()}
+
+    def _stops_of(self, signal: Signal) -> Iterator[StopLineAt]:
+        lanes = [self.lanes[name] for name in signal.lanes]
+        if signal.stop_line is None:
+            for lane in lanes:
+                s = lane.length if lane.junction is None else 0.0
+                x, y, _, heading = lane.at(s)
+                yield StopLineAt(x, y, heading, lane.width(s) / 2)
+            return
+        line = self.stop_lines[signal.stop_line]
+        first, last = line.points[0, :2], line.points[-1, :2]
+        across = math.atan2(last[1] - first[1], last[0] - first[0])
+        x, y = ((first + last) / 2).tolist()
+        ruled = lanes or [self.lanes[name] for name in line.lanes]
+        # Without lanes, traffic approaches the front of the signal.
+        way = signal.heading + math.pi
+        if ruled:
+            way = float(ruled[0].headings[-1 if ruled[0].junction is None else 0])
+        turned = across + math.pi / 2
+        heading = turned if math.cos(turned - way) > 0 else turned + math.pi
+        yield StopLineAt(x, y, heading, math.hypot(*(last - first)) / 2)
 
     @cached_property
     def road_places(self) -> Mapping[str, tuple[str, int]]:

@@ -151,6 +151,16 @@ def test_elevation_superelevation_and_lane_offset_move_the_lanes(tmp_path):
     assert (x, y, z) == pytest.approx((60, t * math.cos(0.1), 1 + 6 + t * math.sin(0.1)), abs=1e-6)
 
 
+def test_marks_of_crosswalks_are_no_traffic_lights(tmp_path):
+    mark, light = (
+        f'<signal id="{d}" s="90" t="0" dynamic="{d}" orientation="+" type="1000003"/>'
+        for d in ("no", "yes")
+    )
+    graph = read_map(one_road(tmp_path, STRAIGHT, 100.0, more=f"<signals>{mark}{light}</signals>"))
+
+    assert {k: s.kind for k, s in graph.signals.items()} == {"no": "other", "yes": "traffic_light"}
+
+
 def test_signals_rule_the_lanes_that_they_face_and_find_their_stop_line(tmp_path):
     geometry = '<geometry s="0" x="0" y="0" hdg="0" length="100"><line/></geometry>'
     more = """<signals>

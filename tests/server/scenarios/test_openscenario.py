@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from real2sim_proto.storyboard import Storyboard, story_actions
+from real2sim_proto.storyboard import Storyboard, resolved, story_actions
 from real2sim_server.scenarios import ScenarioError
 from real2sim_server.scenarios.gallery import corner_case
 from real2sim_server.scenarios.openscenario import (
@@ -211,3 +211,73 @@ def test_curves_and_clearances_are_read_back_as_written():
 
     again = read_openscenario_text(write_openscenario(written), "case.xosc").board
     assert again.stories == written.stories
+
+
+PLACES = """<WorldPosition x="1" y="{s}2" h="{s}0.5" />
+<RelativeWorldPosition entityRef="Ego" dx="1" dy="{s}2">
+  <Orientation type="relative" h="{s}0.5" /></RelativeWorldPosition>
+<RelativeObjectPosition entityRef="Ego" dx="1" dy="{s}2" />
+<RoadPosition roadId="1" s="3" t="{s}2"><Orientation type="absolute" h="{s}0.5" /></RoadPosition>
+<RelativeRoadPosition entityRef="Ego" ds="3" dt="{s}2" />
+<LanePosition roadId="1" laneId="-1" s="3" offset="{s}0.5" />
+<RelativeLanePosition entityRef="Ego" dLane="1" ds="3" offset="{s}0.5" />"""
+
+
+def with_places(sign, description):
+    """A file with places in a trajectory and with lateral values of other elements."""
+    places = PLACES.format(s=sign).replace("\n  <Orient", "<Orient").splitlines()
+    vertices = "".join(f'<Vertex time="0"><Position>{p}</Position></Vertex>' for p in places)
+    actions = f"""<FollowTrajectoryAction><Trajectory name="t" closed="false"><Shape>
+    <Polyline>{vertices}</Polyline></Shape></Trajectory></FollowTrajectoryAction>|
+    <LaneOffsetAction continuous="true"><LaneOffsetActionDynamics dynamicsShape="step" />
+    <LaneOffsetTarget><AbsoluteTargetLaneOffset value="{sign}2" /></LaneOffsetTarget>
+    </LaneOffsetAction>|<TeleportAction><Position>
+    <WorldPosition x="0" y="{sign}$gap" h="${{{sign}1 * $gap}}" /></Position></TeleportAction>|
+    <LaneChangeAction targetLaneOffset="{sign}0.25"><LaneChangeActionDynamics dynamicsShape="step"
+    dynamicsDimension="time" value="0" /><LaneChangeTarget><RelativeTargetLane entityRef="Ego"
+    value="1" /></LaneChangeTarget></LaneChangeAction>"""
+    kinds = ("RoutingAction", "LateralAction", None, "LateralAction")
+    made = "".join(
+        f"<PrivateAction><{k}>{a}</{k}></PrivateAction>"
+        if k
+        else f"<PrivateAction>{a}</PrivateAction>"
+        for k, a in zip(kinds, actions.split("|"), strict=True)
+    ).replace('"-$gap"', '"${-1 * $gap}"')
+    at = CASE.index("</Private>")
+    text = CASE[:at] + made + CASE[at:]
+    start = text.index(' description="') + len(' description="')
+    return text[:start] + description + text[text.index('"', start) :]
+
+
+def test_files_with_the_coordinates_of_carla_are_mirrored():
+    left = read(with_places("", "case"))
+    text = with_places("-", "CARLA:case").encode()
+    found = read_openscenario_text(text, "case.xosc")
+
+    assert resolved(found.board) == resolved(left)
+    assert [n for n in found.notes if "left-handed" in n] == [
+        "coordinates are left-handed, as CARLA's: they are mirrored"
+    ]
+    back = read(write_openscenario(found.board).decode())
+    assert resolved(back) == resolved(left)
+
+
+def test_offsets_in_left_lanes_of_carla_are_to_the_right_of_the_traffic():
+    text = with_places("-", "CARLA:case").replace('laneId="-1"', 'laneId="1"')
+    vertices = read(text).init[-4].action.curve.vertices
+
+    assert vertices[5].position.offset == -0.5
+
+
+def test_a_name_that_marks_the_coordinates_of_carla_is_not_written():
+    with pytest.raises(ScenarioError, match="rename it"):
+        write_openscenario(Storyboard(name="CARLA:case"))
+
+
+def test_a_random_route_is_read_and_written():
+    route = "<RoutingAction><RandomRouteAction /></RoutingAction>"
+    at = CASE.index("</Private>")
+    found = read(f"{CASE[:at]}<PrivateAction>{route}</PrivateAction>{CASE[at:]}")
+
+    assert "random_route" in [entry.action.kind for entry in found.init]
+    assert read(write_openscenario(found).decode()) == found

@@ -46,8 +46,8 @@ def test_of_lanes_that_turn_equally_the_right_one_is_straight_on():
     right = Lane("b", "driving", line * (1, -1, 1), width)
     graph = LaneGraph.of([left, right, straight("c")])
 
-    assert graph.straightest([left, right]).lane_id == "b"
-    assert graph.straightest([left, right, graph.lane("c")]).lane_id == "c"
+    found = graph.straightest_first([left, right, graph.lane("c")])
+    assert [lane.lane_id for lane in found] == ["c", "b", "a"]
 
 
 @pytest.mark.parametrize("offset", [-1.5, 0.0, 1.2])

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from real2sim_server.scene import Signal
+from real2sim_server.scene import Lane, LaneGraph, Signal
 from real2sim_server.scene.lane import StopLine
 from real2sim_server.world import scoring
 from real2sim_server.world.recording import instant_row, read_instant
@@ -118,6 +118,25 @@ def test_a_signal_without_a_stop_line_applies_at_the_lane_end():
     far = context(40, road_map=mapped(lanes=("own",)))
     assert judged(with_signal(always("red"), line=None), far).lights.placed == {"s"}
     assert light_compliance(judged(with_signal(always("red"), line=None), far)) == 1.0
+
+
+def test_a_signal_of_a_lane_in_a_junction_applies_at_the_start_of_the_lane():
+    centre = np.array([[AT, 0.0, 0.0], [60.0, 0.0, 0.0]])
+    crossing = Lane("through", "driving", centre, np.full(2, 3.5), junction="j")
+    light = Signal("s", "traffic_light", (25.0, 3.0, 4.0), math.pi, lanes=("through",))
+    given = context(40, road_map=RoadMap(LaneGraph.of([crossing], signals=[light])))
+
+    assert light_compliance(judged(with_signal(always("red"), line=None), given)) == 0.0
+
+
+def test_a_stop_line_of_the_map_keeps_its_width_in_a_storyboard():
+    light = Signal("s", "traffic_light", (25.0, 3.0, 4.0), math.pi, stop_line="l")
+    wide = StopLine("l", np.array([[AT, -1.75, 0.0], [AT, 5.25, 0.0]]), lanes=("own",))
+    given = context(40, road_map=RoadMap(street(signals=[light], stop_lines=[wide])))
+
+    for line, compliance in [((AT, 1.75, 0.0), 0.0), ((AT + 1.0, 1.75, 0.0), 1.0)]:
+        instants = with_signal(always("red"), line=line, y=4.5)
+        assert light_compliance(judged(instants, given)) == compliance
 
 
 def test_assumptions_name_the_signals_that_counted():

@@ -21,6 +21,9 @@ MAX_BYTES, MAX_ELEMENTS, MAX_DEPTH = 64 << 20, 1_000_000, 200
 WITHOUT_EFFECT = frozenset({"License", "Properties"})
 """Elements with notes of other programs, which are not part of the scenario."""
 
+CARLA = "CARLA:"
+"""Beginning of the description of files with CARLA's left-handed coordinates."""
+
 _NEEDED = {
     "Event": {"Action"},
     "Maneuver": {"Event"},
@@ -504,7 +507,7 @@ def declared(part: Part, texts: Mapping[str, str], values: Mapping[str, Any]) ->
         text, value = scope.expression(given), scope.value(given)
         if name in texts:
             text, value = texts[name], values[name]
-        scope.texts[name] = _embedded(text)
+        scope.texts[name] = embedded(text)
         scope.values[name] = typed(each, value, kind)
         check_constraints(own, name, scope.values[name])
     return scope
@@ -533,7 +536,7 @@ def top_level(part: Part | None, given: Mapping[str, Any]) -> tuple[Scope, dict[
             text, value = "", typed(each, given[name], kind)
         scope.values[name] = value
         if "$" in text:
-            scope.texts[name] = _embedded(scope.expression(text))
+            scope.texts[name] = embedded(scope.expression(text))
         elif kind in NUMBERS or kind == "boolean":
             parameters[name] = value
             scope.texts[name] = f"${name}"
@@ -593,6 +596,6 @@ def holds(value: Any, rule: str, text: str) -> bool:
     return found
 
 
-def _embedded(text: str) -> str:
+def embedded(text: str) -> str:
     """An expression as part of another one."""
     return f"({text[2:-1]})" if text.startswith("${") else text

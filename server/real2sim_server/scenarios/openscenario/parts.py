@@ -19,6 +19,7 @@ from .elements import (
     STATES,
     Part,
     declared_name,
+    embedded,
     holds,
     read_all,
     scoped,
@@ -39,10 +40,18 @@ class Positions:
     Args:
         entry: looks up catalog entries.
         orientation: type of an orientation without one, which depends on the version of the file.
+        mirrored: y, t, offsets and angles are positive to the right, as in CARLA.
     """
 
-    def __init__(self, entry: Resolve, orientation: str) -> None:
-        self.entry, self._default = entry, orientation
+    def __init__(self, entry: Resolve, orientation: str, *, mirrored: bool = False) -> None:
+        self.entry, self._default, self.mirrored = entry, orientation, mirrored
+
+    def left(self, part: Part, name: str, default: float | None = None) -> float | str:
+        """A lateral coordinate, an angle or a curvature, positive to the left."""
+        number = part.number(name, default)
+        if not self.mirrored:
+            return number
+        return f"${{-{embedded(number)}}}" if isinstance(number, str) else 0.0 - number
 
     def position(self, part: Part) -> Fields:
         """The position in an element."""
@@ -82,14 +91,14 @@ class Positions:
             return None
         _level(found)
         relative = found.choice("type", {"relative": True, "absolute": False}, self._default)
-        return {"h": found.number("h", 0.0), "relative": relative}
+        return {"h": self.left(found, "h", 0.0), "relative": relative}
 
     def _world(self, part: Part) -> Fields:
         _level(part)
         z = part.number_or_none("z")
-        h = part.number("h", 0.0)
         return {
-            "kind": "world", "x": part.number("x"), "y": part.number("y"), "h": h,
+            "kind": "world", "x": part.number("x"), "y": self.left(part, "y"),
+            "h": self.left(part, "h", 0.0),
             **({"z": z} if z not in {None, 0.0} else {}),
         }  # fmt: skip
 
@@ -99,7 +108,7 @@ class Positions:
         return _with(
             {
                 "kind": kind, "entity": part.text("entityRef"),
-                "dx": part.number("dx"), "dy": part.number("dy"),
+                "dx": part.number("dx"), "dy": self.left(part, "dy"),
             },
             self._orientation(part),
         )  # fmt: skip
@@ -107,21 +116,24 @@ class Positions:
     def _road(self, part: Part) -> Fields:
         fields = {
             "kind": "road", "road": part.text("roadId"),
-            "s": part.number("s"), "t": part.number("t"),
+            "s": part.number("s"), "t": self.left(part, "t"),
         }  # fmt: skip
         return _with(fields, self._orientation(part))
 
     def _relative_road(self, part: Part) -> Fields:
         fields = {
             "kind": "relative_road", "entity": part.text("entityRef"),
-            "ds": part.number("ds"), "dt": part.number("dt"),
+            "ds": part.number("ds"), "dt": self.left(part, "dt"),
         }  # fmt: skip
         return _with(fields, self._orientation(part))
 
     def _lane(self, part: Part) -> Fields:
+        lane = part.integer("laneId")
+        # CARLA measures it to the right of the traffic, which is left of the line in left lanes.
+        offset = part.number("offset", 0.0) if lane > 0 else self.left(part, "offset", 0.0)
         fields = {
-            "kind": "lane", "road": part.text("roadId"), "lane": part.integer("laneId"),
-            "s": part.number("s"), "offset": part.number("offset", 0.0),
+            "kind": "lane", "road": part.text("roadId"), "lane": lane,
+            "s": part.number("s"), "offset": offset,
         }  # fmt: skip
         return _with(fields, self._orientation(part))
 
@@ -131,7 +143,7 @@ class Positions:
             "kind": "relative_lane", "entity": part.text("entityRef"),
             "lanes": part.integer("dLane"), "along": along,
             "ds": part.number("dsLane" if along == "lane" else "ds", 0.0),
-            "offset": part.number("offset", 0.0),
+            "offset": self.left(part, "offset", 0.0),
         }  # fmt: skip
         return _with(fields, self._orientation(part))
 
@@ -142,15 +154,15 @@ class Positions:
             "s": where.number("pathS"),
         }  # fmt: skip
         if where.tag == "FromRoadCoordinates":
-            fields["t"] = where.number("t", 0.0)
+            fields["t"] = self.left(where, "t", 0.0)
         else:
-            fields |= {"lane": where.integer("laneId"), "t": where.number("laneOffset", 0.0)}
+            fields |= {"lane": where.integer("laneId"), "t": self.left(where, "laneOffset", 0.0)}
         return _with(fields, self._orientation(part))
 
     def _trajectory_position(self, part: Part) -> Fields:
         fields = {
             "kind": "trajectory", "curve": self.trajectory(part.child("TrajectoryRef"))["curve"],
-            "s": part.number("s"), "t": part.number("t", 0.0),
+            "s": part.number("s"), "t": self.left(part, "t", 0.0),
         }  # fmt: skip
         return _with(fields, self._orientation(part))
 
@@ -172,8 +184,8 @@ class Positions:
         return {
             "shape": "clothoid",
             "position": self.position(part.child("Position")),
-            "curvature": part.number("curvature"),
-            "curvature_rate": part.number(rate, 0.0),
+            "curvature": self.left(part, "curvature"),
+            "curvature_rate": self.left(part, rate, 0.0),
             "length": part.magnitude("length"),
             "start_time": part.number_or_none("startTime"),
             "stop_time": part.number_or_none("stopTime"),
@@ -185,9 +197,9 @@ class Positions:
             raise part.error("<ClothoidSpline> has no <ClothoidSplineSegment>")
         pieces = [
             {
-                "start": s.number("curvatureStart"), "end": s.number("curvatureEnd"),
+                "start": self.left(s, "curvatureStart"), "end": self.left(s, "curvatureEnd"),
                 "length": s.number("length"), "time": s.number_or_none("timeStart"),
-                "turn": s.number("hOffset", 0.0),
+                "turn": self.left(s, "hOffset", 0.0),
                 "position": None if start is None else self.position(start),
             }
             for s, start in ((s, s.find("PositionStart")) for s in segments)
@@ -384,10 +396,23 @@ class Conditions:
         fields: Fields = {"kind": "speed", **_ruled(part)}
         if part.tag == "RelativeSpeedCondition":
             fields["relative_to"] = part.text("entityRef")
-        return _directed(part, fields)
+        return self._directed(part, fields)
 
     def _acceleration(self, part: Part) -> Fields:
-        return _directed(part, {"kind": "acceleration", **_ruled(part)})
+        return self._directed(part, {"kind": "acceleration", **_ruled(part)})
+
+    def _directed(self, part: Part, fields: Fields) -> Fields:
+        """The condition in a direction, if one is given; nothing moves vertically."""
+        if "direction" not in part.raw.attributes:
+            return fields
+        words = {"longitudinal": "longitudinal", "lateral": "lateral", "vertical": None}
+        direction = part.choice("direction", words)
+        if direction == "lateral" and self._positions.mirrored:
+            raise part.error("direction 'lateral' is not supported in CARLA's coordinates")
+        if direction is not None:
+            return {**fields, "direction": direction}
+        part.ignore_attribute("direction", "nothing moves vertically")
+        return ALWAYS if holds(0.0, fields["rule"], part.text("value")) else NEVER
 
     def _collision(self, part: Part) -> Fields:
         target = part.only({"EntityRef", "ByType"})
@@ -414,7 +439,8 @@ class Conditions:
         fields: Fields = {"entity": part.text("entityRef")} if "Rel" in part.tag else {}
         if frame == "road" and not fields:
             raise part.error("coordinateSystem of <AngleCondition> is supported as 'world'")
-        angle, tolerance = part.number("angle"), part.number("angleTolerance")
+        angle = self._positions.left(part, "angle")
+        tolerance = part.number("angleTolerance")
         if not turned:
             part.ignore_attribute("angleType", "objects stay level, so pitch and roll are 0")
             level = abs(float(part.text("angle"))) <= float(part.text("angleTolerance"))
@@ -435,18 +461,6 @@ def _measured(part: Part) -> Fields:
     if along:
         measure, frame = "longitudinal", "lane"
     return {"measure": measure, "frame": frame, "freespace": part.flag("freespace", False)}
-
-
-def _directed(part: Part, fields: Fields) -> Fields:
-    """The condition in a direction, if one is given; nothing moves vertically."""
-    if "direction" not in part.raw.attributes:
-        return fields
-    words = {"longitudinal": "longitudinal", "lateral": "lateral", "vertical": None}
-    direction = part.choice("direction", words)
-    if direction is not None:
-        return {**fields, "direction": direction}
-    part.ignore_attribute("direction", "nothing moves vertically")
-    return ALWAYS if holds(0.0, fields["rule"], part.text("value")) else NEVER
 
 
 _BY_VALUE: dict[str, Any] = {
@@ -550,7 +564,7 @@ class Actions:
         target = part.child("LaneChangeTarget").only({"AbsoluteTargetLane", "RelativeTargetLane"})
         fields: Fields = {
             "kind": "lane_change", "lane": target.integer("value"),
-            "offset": part.number("targetLaneOffset", 0.0),
+            "offset": self._positions.left(part, "targetLaneOffset", 0.0),
             "dynamics": _dynamics(part.child("LaneChangeActionDynamics")),
         }  # fmt: skip
         if target.tag == "RelativeTargetLane":
@@ -564,7 +578,7 @@ class Actions:
         how = part.child("LaneOffsetActionDynamics")
         fields: Fields = {
             "kind": "lane_offset",
-            "offset": target.number("value"),
+            "offset": self._positions.left(target, "value"),
             "continuous": part.flag("continuous"),
             "shape": how.choice("dynamicsShape", SHAPES),
             "acceleration": how.number_or_none("maxLateralAcc"),
@@ -645,6 +659,9 @@ class Actions:
 
     def _assign_route(self, part: Part) -> Fields:
         return {"kind": "assign_route", "route": self._positions.route(part)}
+
+    def _random_route(self, _part: Part) -> Fields:
+        return {"kind": "random_route"}
 
     def _acquire_position(self, part: Part) -> Fields:
         place = self._positions.position(part.child("Position"))
@@ -791,6 +808,7 @@ _ACTIONS: dict[str, Any] = {
     "SynchronizeAction": Actions._synchronize,
     "FollowTrajectoryAction": Actions._follow_trajectory,
     "AssignRouteAction": Actions._assign_route,
+    "RandomRouteAction": Actions._random_route,
     "AcquirePositionAction": Actions._acquire_position,
     "TeleportAction": Actions._teleport,
     "VisibilityAction": Actions._visibility,

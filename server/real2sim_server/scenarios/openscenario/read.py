@@ -16,6 +16,7 @@ from real2sim_proto.storyboard_actions import SpeedAction
 
 from .. import ScenarioError
 from .elements import (
+    CARLA,
     PEDESTRIANS,
     PRIORITIES,
     VEHICLES,
@@ -399,7 +400,8 @@ def _header(whole: Part) -> Fields:
         raise header.error(f"is of version {major}.{minor}; versions 1.0 to 1.3 are read")
     date = header.text("date", "")
     return {
-        "name": header.text("description", "")[:200], "author": header.text("author", "")[:200],
+        "name": header.text("description", "").removeprefix(CARLA)[:200],
+        "author": header.text("author", "")[:200],
         "date": date[:40],
     }  # fmt: skip
 
@@ -410,10 +412,14 @@ class _Reader:
     def __init__(self, whole: Part, folder: Path | None, options: ReadOptions) -> None:
         self._whole, self._folder, self._options = whole, folder, options
         self.catalogs = Catalogs(folder, options.leave_out)
-        minor = whole.child("FileHeader").integer("revMinor")
-        positions = Positions(self.catalogs.entry, "relative" if minor >= 3 else "absolute")
-        self._actions, self._conditions = Actions(positions), Conditions(positions)
+        header = whole.child("FileHeader")
+        default = "relative" if header.integer("revMinor") >= 3 else "absolute"
+        mirrored = header.text("description", "").startswith(CARLA)
+        self._positions = Positions(self.catalogs.entry, default, mirrored=mirrored)
+        self._actions, self._conditions = Actions(self._positions), Conditions(self._positions)
         self._notes, self.road_file = whole.notes, None
+        if mirrored:
+            self._notes.add("coordinates are left-handed, as CARLA's: they are mirrored")
 
     road_file: Path | None
 
@@ -519,7 +525,7 @@ class _Reader:
         model = holders[0]
         model = self._of_catalog(model) if model.tag == "CatalogReference" else scoped(model)
         self._object_controllers(part, name, ego)
-        size, centre = _box(model)
+        size, centre = self._box(model)
         fields: Fields = {
             "name": name,
             "kind": "ego" if name == ego else "new",
@@ -536,6 +542,14 @@ class _Reader:
             category = model.choice("pedestrianCategory", PEDESTRIANS)
             return fields | {"category": category}
         return fields | {"category": model.text("miscObjectCategory")}
+
+    def _box(self, part: Part) -> tuple[list[Any], list[Any]]:
+        box = part.child("BoundingBox")
+        centre, size = box.child("Center"), box.child("Dimensions")
+        return (
+            [size.number("length"), size.number("width"), size.number("height")],
+            [centre.number("x"), self._positions.left(centre, "y"), centre.number("z")],
+        )
 
     def _of_catalog(self, part: Part) -> Part:
         for kind in ("Vehicle", "Pedestrian", "MiscObject"):
@@ -653,12 +667,3 @@ class _Reader:
 
 def _with_effect(actions: list[Fields]) -> list[Fields]:
     return [action for action in actions if action["kind"] != "custom"]
-
-
-def _box(part: Part) -> tuple[list[Any], list[Any]]:
-    box = part.child("BoundingBox")
-    centre, size = box.child("Center"), box.child("Dimensions")
-    return (
-        [size.number("length"), size.number("width"), size.number("height")],
-        [centre.number("x"), centre.number("y"), centre.number("z")],
-    )

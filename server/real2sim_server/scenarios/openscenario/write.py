@@ -10,6 +10,7 @@ from real2sim_proto.storyboard import MapRoads, Storyboard
 
 from .. import ScenarioError
 from .elements import (
+    CARLA,
     DIMENSIONS,
     EDGES,
     ELEMENTS,
@@ -75,6 +76,15 @@ def _check(board: Storyboard) -> None:
             raise _wordless(f"entity {entity.name!r} is bound to an object or asset of a scene")
         if entity.box is None:
             raise _wordless(f"entity {entity.name!r} has no box; give it one")
+    if board.map_signals is not None:
+        raise _wordless(
+            "map_signals; leave it out, or list the map's lights in signals and controllers"
+        )
+    if board.name.startswith(CARLA):
+        raise ScenarioError(
+            f"the storyboard's name {board.name!r} begins with {CARLA!r}, which marks files with "
+            "left-handed coordinates; rename it"
+        )
     if board.distributions:
         raise _wordless("distributions belong in a separate file; leave them out")
 
@@ -288,6 +298,10 @@ def _assign_route(parent: Element, a: Mapping[str, Any]) -> None:
     _route(_add(_add(parent, "RoutingAction"), "AssignRouteAction"), a["route"])
 
 
+def _random_route(parent: Element, _a: Mapping[str, Any]) -> None:
+    _add(_add(parent, "RoutingAction"), "RandomRouteAction")
+
+
 def _acquire_position(parent: Element, a: Mapping[str, Any]) -> None:
     part = _add(_add(parent, "RoutingAction"), "AcquirePositionAction")
     _position(_add(part, "Position"), a["position"])
@@ -357,6 +371,7 @@ _WRITE = {
     "synchronize": _synchronize,
     "follow_trajectory": _follow_trajectory,
     "assign_route": _assign_route,
+    "random_route": _random_route,
     "acquire_position": _acquire_position,
     "teleport": _teleport,
     "visibility": _visibility,

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..._numba import kernel
 from ..._records import made_quickly
-from ...scene import LaneGraph, Signal
+from ...scene.lane import StopLineAt
 from ..path import Float, LoopTransform
 from ..plan import PlannedTrajectory
 from ..storyboard.program import ShownSignal
@@ -499,17 +499,11 @@ def fault_class(category: str) -> str:
 ALONG = 0.5
 """Minimum cosine between an ego's heading and the direction of a stop line."""
 
+SAME_LINE_M = 0.01
+"""Maximum distance between the centres of a stop line of the storyboard and the same of the map."""
+
 LAMPS = {"on", "off", "flashing", "counting"}
 """Lamp states of a signal state such as ``off;off;on``, red first."""
-
-
-class StopLineAt(NamedTuple):
-    """A stop line: centre [m] and heading of traffic [rad], world frame; half its width [m]."""
-
-    x: float
-    y: float
-    heading: float
-    half: float
 
 
 @dataclass(frozen=True)
@@ -581,38 +575,23 @@ def shows_red(state: str) -> bool:
 def stop_lines(signal: ShownSignal, context: ScoringContext) -> Iterator[StopLineAt]:
     """Stop lines of a signal.
 
-    Uses the line of the storyboard with the width of a lane. Without one, uses the stop line of the
-    map, or else the ends of the signal's lanes. Empty if none is known.
+    Uses the line of the storyboard with the width of a lane. Without one, or if it is that of the
+    map, uses the stop line of the map, or else the ends of the signal's lanes. Empty if none is
+    known.
     """
     graph = None if context.road_map is None else context.road_map.graph
-    if signal.stop_line is not None:
+    mapped = () if graph is None else graph.stops.get(signal.signal_id, ())
+    if signal.stop_line is None or any(
+        math.dist(signal.stop_line[:2], line[:2]) < SAME_LINE_M for line in mapped
+    ):
+        yield from mapped
+    else:
         x, y, heading = signal.stop_line
         found = None if graph is None else graph.nearest(x, y, heading, within=5.0)
         half = context.lane
         if graph is not None and found is not None:
             half = graph.lanes[found.lane_id].width(found.s) / 2
         yield StopLineAt(x, y, heading, half)
-    elif graph is not None and (mapped := graph.signals.get(signal.signal_id)) is not None:
-        yield from _of_map(mapped, graph)
-
-
-def _of_map(signal: Signal, graph: LaneGraph) -> Iterator[StopLineAt]:
-    lanes = [graph.lanes[name] for name in signal.lanes]
-    if signal.stop_line is None:
-        for lane in lanes:
-            x, y, _, heading = lane.at(lane.length)
-            yield StopLineAt(x, y, heading, lane.width(lane.length) / 2)
-        return
-    line = graph.stop_lines[signal.stop_line]
-    first, last = line.points[0, :2], line.points[-1, :2]
-    across = math.atan2(last[1] - first[1], last[0] - first[0])
-    x, y = ((first + last) / 2).tolist()
-    ruled = lanes or [graph.lanes[name] for name in line.lanes]
-    # Without lanes, traffic approaches the front of the signal.
-    way = float(ruled[0].headings[-1]) if ruled else signal.heading + math.pi
-    turned = across + math.pi / 2
-    heading = turned if math.cos(turned - way) > 0 else turned + math.pi
-    yield StopLineAt(x, y, heading, math.hypot(*(last - first)) / 2)
 
 
 def _crossed(line: StopLineAt, before: EgoSample, now: EgoSample, context: ScoringContext) -> bool:

@@ -20,6 +20,7 @@ from real2sim_proto.storyboard_actions import (
     LateralDistanceAction,
     LightStateAction,
     LongitudinalDistanceAction,
+    RandomRouteAction,
     SpeedAction,
     SpeedLimits,
     SpeedProfileAction,
@@ -323,6 +324,12 @@ def _assign_route(actor: EntityState, action: AssignRouteAction, at: Beginning) 
     return _done(_on_route(actor, at.view.network.route(places)), at)
 
 
+def _random_route(actor: EntityState, action: RandomRouteAction, at: Beginning) -> EntityState:
+    way = at.view.network.random_way(Place(actor.x, actor.y, actor.h), actor.name)
+    freed = copy_with(actor, trajectory=None, lateral=None)
+    return _done(freed.on_lane(at.view.network) if way is None else freed.on_way(way), at)
+
+
 def _acquire_position(
     actor: EntityState, action: AcquirePositionAction, at: Beginning
 ) -> EntityState:
@@ -389,6 +396,7 @@ _BEGIN: Mapping[type[Any], Callable[[EntityState, Any, Beginning], EntityState]]
     SynchronizeAction: _synchronize,
     FollowTrajectoryAction: _follow_trajectory,
     AssignRouteAction: _assign_route,
+    RandomRouteAction: _random_route,
     AcquirePositionAction: _acquire_position,
     TeleportAction: _teleport,
     VisibilityAction: _visibility,

@@ -25,7 +25,7 @@ from real2sim_proto.storyboard_actions import (
 from ...scene.errors import SceneError
 from ...scene.lane import LANE_KINDS, Lane, Road
 from ...scene.lane_graph import LaneGraph
-from ..common import WorldError
+from ..common import Draws, WorldError
 from ..path import Float, LoggedPath
 from ..traffic.driver import STRAIGHT, parallel_lane
 
@@ -111,6 +111,9 @@ class RoadNetwork(Protocol):
     def route(self, places: list[Place]) -> LoggedPath:
         """The path along lanes through places. Raises WorldError: no such path."""
 
+    def random_way(self, place: Place, entity: str) -> Way | None:
+        """The way of an entity along the lane of a place, random at each fork; None off lanes."""
+
 
 @dataclass(frozen=True, eq=False)
 class RouteNetwork:
@@ -190,6 +193,9 @@ class RouteNetwork:
     def route(self, places: list[Place]) -> LoggedPath:  # noqa: D102
         return path_through(places)
 
+    def random_way(self, place: Place, entity: str) -> Way | None:  # noqa: D102
+        return None
+
 
 def skipping_zero(lane: int, lanes: int) -> int:
     """Id of the lane ``lanes`` further in +t direction; there is no lane 0."""
@@ -261,10 +267,12 @@ class GraphNetwork:
 
     Attributes:
         graph: lane graph, world frame.
+        draws: random numbers of the episode for random routes; None: they turn least, too.
         ways: cache of paths by lane and direction.
     """
 
     graph: LaneGraph
+    draws: Draws | None = None
     ways: dict[tuple[str, bool], Way] = field(default_factory=dict)
 
     def locate(self, x: float, y: float, h: float) -> RoadPoint | None:  # noqa: D102
@@ -339,6 +347,18 @@ class GraphNetwork:
             pieces.append(ends if names is None else self._between(names, a.s, b.s))
         return path_through([Place(x, y, 0.0) for x, y, _ in np.concatenate(pieces).tolist()])
 
+    def random_way(self, place: Place, entity: str) -> Way | None:  # noqa: D102
+        here = self.locate(place.x, place.y, place.h)
+        if here is None:
+            return None
+        lane_id, _ = self._part(here.road, here.lane, here.s)
+        along = math.cos(place.h - here.h) >= 0.0
+        forwards = along == self.drives_along(here.road, here.lane)
+        draws, what = self.draws, f"storyboard.route.{entity}"
+        drawn = None if draws is None else lambda number: draws.uniform(what, number)[0]
+        path, length = self._path(lane_id, forwards=forwards, drawn=drawn)
+        return Way("route", 1, True, path, length)
+
     def _between(self, names: tuple[str, ...], start: float, end: float) -> Float:
         """Points along lanes from ``start`` on the first to ``end`` on the last.
 
@@ -374,18 +394,28 @@ class GraphNetwork:
             raise _refused(error) from error
         return part.lane_id, part.centre_t(held)
 
-    def _next(self, lane_id: str, *, forwards: bool, besides: Sequence[Lane] = ()) -> Lane | None:
-        """The lane that continues a lane and turns least; None if it ends."""
+    def _next(
+        self, lane_id: str, *, forwards: bool, besides: Sequence[Lane] = (), u: float = 0.0
+    ) -> Lane | None:
+        """The lane that continues a lane; None if it ends.
+
+        At a fork, the share ``u`` of the lanes turns less; 0: the lane turns least.
+        """
         lane, before = self.graph.lane(lane_id), self.graph.predecessors
         names = lane.successors if forwards else before[lane_id]
         onward = [found for n in names if (found := self.graph.lane(n)) not in besides]
-        return self.graph.straightest(onward, forwards=forwards) if onward else None
+        onward = self.graph.straightest_first(onward, forwards=forwards)
+        return onward[int(u * len(onward))] if onward else None
 
-    def _path(self, lane_id: str, *, forwards: bool) -> tuple[LoggedPath, float]:
+    def _path(
+        self, lane_id: str, *, forwards: bool, drawn: Callable[[int], float] | None = None
+    ) -> tuple[LoggedPath, float]:
+        """The path along a lane and those that continue it; ``drawn(k)``: see ``u`` of _next."""
         lanes, length = [self.graph.lane(lane_id)], 0.0
         while length < REACH:
             length += lanes[-1].length
-            onward = self._next(lanes[-1].lane_id, forwards=forwards, besides=lanes)
+            u = 0.0 if drawn is None else drawn(len(lanes))
+            onward = self._next(lanes[-1].lane_id, forwards=forwards, besides=lanes, u=u)
             if onward is None:
                 break
             lanes.append(onward)

@@ -37,6 +37,7 @@ from ..boxes import REAR_OVERHANG
 from ..common import Draws, WorldError, copy_with
 from ..ego_motion import Motion
 from ..traffic.driver import ScriptedEntity, Surroundings, recorded_pose
+from .map_lights import with_map_signals
 from .program import PLACING, Program, ShownSignal, program_of, shown_at
 from .progress import COMPLETE, ElementChange, Progress, ProgressState
 from .roads import GraphNetwork, Place, RoadNetwork, RouteNetwork
@@ -322,6 +323,7 @@ class StoryboardRun:
         ego_size: tuple[float, float, float],
         network: RoadNetwork | None = None,
         draws: Draws | None = None,
+        lanes: LaneGraph | None = None,
     ) -> StoryboardRun:
         """The storyboard at the start of an episode, after its init actions.
 
@@ -332,15 +334,18 @@ class StoryboardRun:
             ego_size: size of the ego's box [m].
             network: road network; None for lanes along the route.
             draws: random numbers of the episode; None to keep parameters as written.
+            lanes: map with the traffic lights of ``map_signals``; None: they have no states.
 
         Raises:
             WorldError: INVALID_REQUEST if the storyboard cannot be executed.
         """
         board, sampled = drawn_values(board, draws)
         board = _resolved(board)
+        if board.map_signals is not None and lanes is not None:
+            board = with_map_signals(board, board.map_signals, lanes)
         if network is None:
-            lanes = board.roads if isinstance(board.roads, RouteLanes) else RouteLanes()
-            network = RouteNetwork.of(lanes, surroundings.route)
+            roads = board.roads if isinstance(board.roads, RouteLanes) else RouteLanes()
+            network = RouteNetwork.of(roads, surroundings.route)
         program = program_of(board)
         entities = {
             e.name: _first(
@@ -566,12 +571,13 @@ def begin_storyboard(
         subjects_of(resolved(board).entities, state, scene),
         surroundings,
         ego_size=scene.ego_size,
-        network=_network(board, scene),
+        network=_network(board, scene, draws),
         draws=draws,
+        lanes=_lights(board, scene),
     )
 
 
-def _network(board: Storyboard, scene: Scene) -> RoadNetwork | None:
+def _network(board: Storyboard, scene: Scene, draws: Draws) -> RoadNetwork | None:
     """Road network of the scene's map if the storyboard uses one; None for route lanes."""
     if not isinstance(board.roads, MapRoads):
         return None
@@ -584,4 +590,19 @@ def _network(board: Storyboard, scene: Scene) -> RoadNetwork | None:
             hint="run it on a scene made from that network, or with storyboard.roads of kind "
             "'route', lanes along the ego's route",
         )
-    return GraphNetwork(graph)
+    return GraphNetwork(graph, draws)
+
+
+def _lights(board: Storyboard, scene: Scene) -> LaneGraph | None:
+    """The scene's map if the storyboard sets the phases of its traffic lights."""
+    if board.map_signals is None:
+        return None
+    graph: LaneGraph | None = getattr(scene, "lanes", None)
+    if graph is None or all(s.kind != "traffic_light" for s in graph.signals.values()):
+        raise WorldError(
+            ErrorCode.INVALID_REQUEST,
+            "storyboard.map_signals sets the phases of the map's traffic lights, and scene "
+            f"{scene.name!r} has {'no map' if graph is None else 'a map without traffic lights'}",
+            hint="leave it out, or give the scene a map with traffic lights",
+        )
+    return graph

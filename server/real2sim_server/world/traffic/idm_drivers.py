@@ -107,7 +107,7 @@ def _chain(
         onward = [n for n in _travelled(graph, names(at)) if n is not lane and n not in found]
         if not onward:
             break
-        at = graph.straightest(onward)
+        at = graph.straightest_first(onward)[0]
         found.append(at)
         length += at.length
     return found

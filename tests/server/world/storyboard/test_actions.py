@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from real2sim_proto.episode import ResetSpec
 from real2sim_server.render import rasterize
 from real2sim_server.render.images import to_uint8
-from real2sim_server.scene import Camera
-from real2sim_server.world.storyboard.roads import Place, path_through
+from real2sim_server.scene import Camera, Lane, LaneGraph, Road, RoadLane
+from real2sim_server.world import World
+from real2sim_server.world.common import Draws
+from real2sim_server.world.storyboard.roads import GraphNetwork, Place, path_through
 
 from .boards import action_at, after, board, drive, event, places, speeds
 
@@ -412,3 +416,50 @@ def test_a_speed_goes_on_following_that_of_the_ego(run):
     worlds = run(action_at(1.0, follow), steps=30)
 
     assert speeds(worlds)[30] == pytest.approx(worlds[30].motion.speed + 1.5)
+
+
+def forked() -> LaneGraph:
+    """A road of 160 m along x, and two that go on from its end: straight, and to the left."""
+    lanes, roads = [], []
+    for name, x, heading, length, onward in [
+        ("0", 0.0, 0.0, 160.0, ("straight", "left")),
+        ("straight", 160.0, 0.0, 50.0, ()),
+        ("left", 160.0, 0.3, 50.0, ()),
+    ]:
+        s, width = np.linspace(0.0, length, 21), np.full(21, 3.5)
+        ahead = [math.cos(heading), math.sin(heading), 0.0]
+        line = np.array([x, 0.0, 0.0]) + np.outer(s, ahead)
+        lanes.append(Lane(name, "driving", line, width, successors=onward))
+        part = RoadLane(-1, name, s, width / 2, -width / 2)
+        roads.append(Road(name, s, line, 0 * s + heading, 0 * s, lanes=(part,)))
+    return LaneGraph.of(lanes, roads=roads)
+
+
+def test_random_routes_take_each_lane_of_a_fork_equally_often():
+    graph, here = forked(), Place(10.0, 0.0, 0.0)
+
+    def is_left(seed, name="car"):
+        way = GraphNetwork(graph, Draws(seed)).random_way(here, name)
+        assert way.length == pytest.approx(210.0)
+        return abs(way.path.at(200.0)[1]) > 1.0
+
+    left = [is_left(seed) for seed in range(200)]
+    assert 75 <= sum(left) <= 125
+    assert left == [is_left(seed) for seed in range(200)]
+    assert left != [is_left(seed, "other") for seed in range(200)]
+
+
+def test_an_entity_follows_its_random_route_to_the_end_of_the_road(make_world, moving):
+    made = make_world(moving(0, 0, speed=10.0), look=moving(500, 50))
+    scene = replace(made.scene, lanes=forked())
+    given = board(init=[("car", {"kind": "random_route"})], roads={"kind": "map"})
+    ends = {}
+    for seed in range(6):
+        world = World(scene, made.state, ResetSpec(storyboard=given, seed=seed))
+        ends[seed] = tuple(np.round(places(drive(world, 115))[-1], 3))
+
+    last = {
+        (210.0, 0.0, 0.0),
+        tuple(np.round((160 + 50 * math.cos(0.3), 50 * math.sin(0.3), 0.3), 3)),
+    }
+    assert set(ends.values()) == last
