@@ -244,6 +244,19 @@ def test_a_lane_change_on_a_route_keeps_the_route(run):
     assert ego.x == pytest.approx(146.5, abs=1e-6)
 
 
+def test_a_parked_entity_with_a_route_stays_as_it_is_parked(run):
+    points = "".join(
+        f'<Waypoint routeStrategy="shortest"><Position>{p}</Position></Waypoint>'
+        for p in (lane(-2, 40.0), lane(-2, 300.0))
+    )
+    route = f"""<RoutingAction><AssignRouteAction><Route name="r" closed="false">{points}</Route>
+    </AssignRouteAction></RoutingAction>"""
+    across = lane(-2, 50.0).replace("/>", '><Orientation type="relative" h="1.5"/></LanePosition>')
+    found = run(scenario(init=private("Ego", put(across), route) + TARGET), seconds=1.0).ego
+
+    assert [e.yaw for e in found] == pytest.approx([1.5] * len(found))
+
+
 def test_an_ego_without_a_speed_stands_still(run):
     init = private("Ego", put(lane(-2, 50.0))) + TARGET
 

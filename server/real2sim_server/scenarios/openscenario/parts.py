@@ -585,12 +585,6 @@ class Actions:
         }
         if target.tag == "RelativeTargetLaneOffset":
             fields["relative_to"] = target.text("entityRef")
-        if fields["shape"] == "linear" and fields["acceleration"] is not None:
-            how.ignore_attribute(
-                "dynamicsShape",
-                "a linear change of the offset with a largest lateral acceleration is sinusoidal",
-            )
-            fields["shape"] = "sinusoidal"
         return fields
 
     def _lateral_distance(self, part: Part) -> Fields:

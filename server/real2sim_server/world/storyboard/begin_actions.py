@@ -30,7 +30,6 @@ from real2sim_proto.storyboard_actions import (
 )
 
 from ..common import WorldError, copy_with
-from ..path import LoggedPath
 from .motion import (
     FollowIdm,
     FollowOffset,
@@ -49,10 +48,7 @@ from .motion import (
     speed_duration,
 )
 from .roads import Place, RoadPoint, Trajectory, Way, course_of, path_through
-from .view import ACROSS, EntityState, PositionResolver, View, across, distance_ahead
-
-MAX_ROUTE_OFFSET = 10.0
-"""Maximum distance from its assigned route at which a teleported entity keeps the route [m]."""
+from .view import EntityState, PositionResolver, View, across, distance_ahead
 
 DEFAULT_DESIRED_SPEED = 3.0
 """Desired speed of an entity at rest when its controller is activated [m/s]."""
@@ -320,8 +316,9 @@ def _follow_trajectory(
 
 
 def _assign_route(actor: EntityState, action: AssignRouteAction, at: Beginning) -> EntityState:
-    places = [at.places.of(w) for w in action.route.waypoints]
-    return _done(_on_route(actor, at.view.network.route(places)), at)
+    path = at.view.network.route([at.places.of(w) for w in action.route.waypoints])
+    actor = copy_with(actor, route=Way("route", 1, True, path, assigned=True))
+    return _done(actor.on_route() if actor.heads_along(path) else actor, at)
 
 
 def _random_route(actor: EntityState, action: RandomRouteAction, at: Beginning) -> EntityState:
@@ -335,34 +332,15 @@ def _acquire_position(
 ) -> EntityState:
     here = Place(actor.x, actor.y, actor.h)
     path = at.view.network.route([here, at.places.of(action.position)])
-    moved = _on_route(actor, path)
+    moved = copy_with(actor, route=Way("route", 1, True, path, assigned=True)).on_route()
     return copy_with(moved, lateral=OffsetChange(
         at.token, "linear", moved.offset, moved.offset, max(path.length - moved.s, 1e-6), True
     ))  # fmt: skip
 
 
-def _on_route(actor: EntityState, path: LoggedPath) -> EntityState:
-    way = Way("route", 1, True, path, assigned=True)
-    return copy_with(actor, trajectory=None, lateral=None).on_way(way)
-
-
 def _teleport(actor: EntityState, action: TeleportAction, at: Beginning) -> EntityState:
-    place = at.places.of(action.position)
-    put = actor.put(place, at.view.network)
-    route = actor.way
-    if route is not None and route.assigned and _is_near_route(place, route):
-        put = put.on_way(route)
+    put = actor.put(at.places.of(action.position), at.view.network)
     return _done(put, at, lateral=None)
-
-
-def _is_near_route(place: Place, route: Way) -> bool:
-    """Whether a place is near a route and roughly aligned with it, so that it can be followed."""
-    near = route.path.nearest(place.x, place.y)
-    # Use points of the route: its headings change between places that may be far apart.
-    (x0, y0, *_), (x1, y1, *_) = (route.path.at(near.s + ds) for ds in (-0.5, 0.5))
-    turn = math.remainder(math.atan2(y1 - y0, x1 - x0) - place.h, math.tau)
-    away = math.dist((place.x, place.y), near.position[:2])
-    return away <= MAX_ROUTE_OFFSET and abs(turn) <= ACROSS
 
 
 def _visibility(actor: EntityState, action: VisibilityAction, at: Beginning) -> EntityState:

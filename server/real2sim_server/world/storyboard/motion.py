@@ -32,8 +32,10 @@ from .view import (
 STEEPEST = {"linear": 1.0, "cubic": 1.5, "sinusoidal": math.pi / 2, "quintic": 1.875}
 """Maximum slope of each shape f(u), u from 0 to 1."""
 
-CURVIEST = {"cubic": 6.0, "sinusoidal": math.pi**2 / 2, "quintic": 10.0 / math.sqrt(3.0)}
-"""Maximum second derivative of each shape; infinite for linear."""
+CURVIEST = {
+    "linear": 6.0, "cubic": 6.0, "sinusoidal": math.pi**2 / 2, "quintic": 10.0 / math.sqrt(3.0),
+}  # fmt: skip
+"""Maximum second derivative of each shape; linear, whose ends have none, takes that of cubic."""
 
 
 def progress(shape: Shape, u: float) -> float:
@@ -557,7 +559,7 @@ def _within_road(actor: EntityState, view: View) -> EntityState:
     beyond = actor.s - end
     if beyond <= 0.0:
         return actor
-    onward = copy_with(actor, s=end, drift=0.0).placed().on_lane(view.network)
+    onward = copy_with(actor, s=end, drift=0.0, route=None).placed().on_lane(view.network)
     assert onward.way is not None
     if onward.way.lane and onward.way.length - onward.s > beyond:
         return copy_with(onward, s=onward.s + beyond, drift=actor.drift)

@@ -29,11 +29,15 @@ from ...edit import ObjectState
 from ...scene import Ground
 from ..boxes import REAR_OVERHANG
 from ..common import WorldError, copy_with
+from ..path import LoggedPath
 from ..traffic.driver import AgentPose, ObservedEgo, Surroundings, level_quaternion
 from .roads import Place, RoadNetwork, RoadPoint, Trajectory, Way, course_of, straight
 
 ACROSS = math.radians(45.0)
 """Maximum heading difference to a lane; entities beyond it continue straight instead [rad]."""
+
+MAX_ROUTE_OFFSET = 10.0
+"""Maximum distance from its assigned route at which an entity that is placed follows it [m]."""
 
 SLOW = 0.5
 """Minimum speed at which lateral motion changes the heading [m/s]."""
@@ -89,6 +93,7 @@ class EntityState:
         drift: part of it across the path, positive left [m/s].
         acceleration: along its path [m/s^2].
         way: path that it follows; None for an ego driven by a planner.
+        route: assigned route, which it follows when it is placed near it, or None.
         s, offset: distance along the path, and offset from it [m].
         turn: heading relative to the path, besides that of its drift [rad].
         travelled: distance travelled since the start of the episode [m].
@@ -115,6 +120,7 @@ class EntityState:
     drift: float = 0.0
     acceleration: float = 0.0
     way: Way | None = None
+    route: Way | None = None
     s: float = 0.0
     offset: float = 0.0
     turn: float = 0.0
@@ -164,13 +170,15 @@ class EntityState:
         return {m.token for m in moving if m is not None}
 
     def put(self, place: Place, network: RoadNetwork) -> EntityState:
-        """The entity at a place, on the lane there or a straight path, at the same speed.
+        """The entity at a place, on its route, the lane there or a straight path.
 
-        It keeps its heading relative to the lane.
+        It keeps its speed, and its heading relative to the route or lane.
         """
         put = copy_with(
             self, x=place.x, y=place.y, h=place.h, z=place.z, drift=0.0, trajectory=None
-        ).on_lane(network)
+        )
+        near = self.route is not None and put.heads_along(self.route.path, MAX_ROUTE_OFFSET)
+        put = put.on_route() if near else put.on_lane(network)
         assert put.way is not None
         turn = 0.0 if put.way.lane == 0 else place.h - put.way.path.at(put.s)[3]
         return copy_with(put, turn=math.remainder(turn, math.tau))
@@ -185,6 +193,17 @@ class EntityState:
             along = abs(turn) <= math.pi / 2
             way = network.way(found.road, found.lane, found.s, along=along)
         return self.on_way(way)
+
+    def heads_along(self, path: LoggedPath, within: float = math.inf) -> bool:
+        """Whether it is at most ``within`` [m] from a path and roughly heads along it."""
+        near = path.nearest(self.x, self.y)
+        away = math.dist((self.x, self.y), near.position[:2])
+        return away <= within and abs(math.remainder(near.yaw - self.h, math.tau)) <= ACROSS
+
+    def on_route(self) -> EntityState:
+        """The entity on its assigned route."""
+        assert self.route is not None
+        return copy_with(self, trajectory=None, lateral=None).on_way(self.route)
 
     def on_way(self, way: Way) -> EntityState:
         """The entity on another path, at its current offset from it."""

@@ -109,6 +109,14 @@ def test_a_lane_offset_keeps_its_highest_acceleration(run):
     assert np.interp(half, np.arange(81), y) == pytest.approx(-0.6, abs=NEAR)
 
 
+def test_a_linear_lane_offset_takes_as_long_as_a_cubic_one(run):
+    aside = {"kind": "lane_offset", "offset": 1.5, "shape": "linear", "acceleration": 1.0}
+    y = places(run(action_at(1.0, aside)))[:, 1]
+
+    # sqrt(6 x 1.5 m / 1 m/s^2) = 3 s
+    assert (y[25], y[40]) == (pytest.approx(0.75, abs=NEAR), pytest.approx(1.5, abs=NEAR))
+
+
 def test_a_lane_offset_leaves_the_speed_along_the_lane(run):
     aside = {"kind": "lane_offset", "offset": -3.0, "shape": "sinusoidal", "acceleration": 5.0}
     x = places(run(action_at(1.0, aside)))[:, 0]
