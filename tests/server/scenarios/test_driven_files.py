@@ -257,6 +257,23 @@ def test_a_parked_entity_with_a_route_stays_as_it_is_parked(run):
     assert [e.yaw for e in found] == pytest.approx([1.5] * len(found))
 
 
+def test_a_lane_change_goes_on_where_a_route_ends(run):
+    points = "".join(
+        f'<Waypoint routeStrategy="shortest"><Position>{p}</Position></Waypoint>'
+        for p in (lane(-2, 40.0), lane(-2, 65.0))
+    )
+    route = f"""<RoutingAction><AssignRouteAction><Route name="r" closed="false">{points}</Route>
+    </AssignRouteAction></RoutingAction>"""
+    change = CUT_IN.replace('value="-2"', 'value="-1"')
+    init = private("Ego", put(lane(-2, 50.0)), route, speed(10.0)) + TARGET
+    ego = run(scenario(init=init, actor="Ego", action=change), seconds=3.0).ego
+
+    # Half of the change is done 10 m on, where the route ends after 15 m.
+    assert ego[15].y == pytest.approx(-3.5, abs=0.15)
+    assert max(b.y - a.y for a, b in itertools.pairwise(ego)) < 0.3
+    assert ego[-1].y == pytest.approx(-1.75)
+
+
 def test_an_ego_without_a_speed_stands_still(run):
     init = private("Ego", put(lane(-2, 50.0))) + TARGET
 
@@ -272,6 +289,28 @@ def test_an_initial_speed_that_takes_time_starts_from_zero(run):
     for step, ego in enumerate(found.ego):
         assert ego.speed == pytest.approx(min(2.0 * step * DT, 8.0), abs=1e-6)
     assert run(scenario(init=init), planner="idm").ego[0].speed == 0.0
+
+
+def test_speeds_that_refer_to_each_other_take_effect_in_the_order_of_the_file(run):
+    def relative(entity: str, value: float) -> str:
+        return speed("x").replace(
+            '<AbsoluteTargetSpeed value="x"/>',
+            f'<RelativeTargetSpeed entityRef="{entity}" value="{value}" continuous="false" '
+            'speedTargetValueType="delta"/>',
+        )
+
+    init = private("Ego", put(lane(-2, 50.0)), relative("Target", 2.0))
+    init += private("Target", put(lane(-1, 50.0)), relative("Ego", 3.0))
+    found = run(scenario(init=init), seconds=0.5)
+
+    assert found.ego[0].speed == pytest.approx(2.0)
+
+
+def test_lane_0_is_the_centre_line_of_the_road(run):
+    init = private("Ego", put(lane(0, 50.0)), speed(0.0)) + TARGET
+    ego = run(scenario(init=init), seconds=0.2).ego[0]
+
+    assert (ego.y, ego.yaw) == pytest.approx((0.0, 0.0))
 
 
 def test_the_ego_has_the_bounding_box_of_the_file(run):

@@ -146,20 +146,23 @@ def _in_order(entries: Sequence[InitAction]) -> tuple[InitAction, ...]:
     """Init actions in the order of the file, but after their dependencies.
 
     A position relative to an entity comes after the position of that entity, and a relative speed
-    after the speed that it refers to.
+    after the speed that it refers to, unless speeds refer to each other.
     """
     waiting, done = list(entries), list[InitAction]()
     while waiting:
         ready = next((e for k, e in enumerate(waiting) if _is_ready(e, waiting, k)), None)
         if ready is None:
-            # Keeping a distance does not depend on the speed of the other entity.
-            ready = next((e for e in waiting if e.action.kind not in PLACING | _SPEEDING), None)
+            # Keeping a distance does not depend on the speed of the other entity, and speeds that
+            # refer to each other take effect in the order of the file.
+            firsts = {e.entity: e for e in reversed(waiting)}.values()
+            later = [e for e in waiting if e in firsts and e.action.kind not in PLACING]
+            ready = min(later, key=lambda e: e.action.kind in _SPEEDING, default=None)
         if ready is None:
             names = " and ".join(repr(e) for e in dict.fromkeys(e.entity for e in waiting))
             raise WorldError(
                 ErrorCode.INVALID_REQUEST,
                 f"{names} have initial positions relative to each other",
-                hint="give one of them an absolute position or speed in the storyboard's init",
+                hint="give one of them an absolute position in the storyboard's init",
             )
         waiting.remove(ready)
         done.append(ready)

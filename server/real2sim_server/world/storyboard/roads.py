@@ -97,7 +97,10 @@ class RoadNetwork(Protocol):
         """
 
     def middle(self, road: str, lane: int, s: float) -> float:
-        """t of a lane centre at ``s``. Raises WorldError: no such lane there."""
+        """t of a lane centre at ``s``; of the centre line for lane 0.
+
+        Raises WorldError: no such lane there.
+        """
 
     def drives_along(self, road: str, lane: int) -> bool:
         """Whether traffic of a lane drives in the direction of the reference line."""
@@ -164,7 +167,9 @@ class RouteNetwork:
         return Place(x - t * math.sin(yaw), y + t * math.cos(yaw), yaw)
 
     def middle(self, road: str, lane: int, s: float) -> float:  # noqa: D102
-        if lane == 0 or not -self.spec.right <= lane <= self.spec.left:
+        if lane == 0:
+            return 0.0
+        if not -self.spec.right <= lane <= self.spec.left:
             raise WorldError(
                 ErrorCode.INVALID_REQUEST,
                 f"lane {lane} is none of those along the route",
@@ -316,6 +321,11 @@ class GraphNetwork:
         return Place(x, y, h, z)
 
     def middle(self, road: str, lane: int, s: float) -> float:  # noqa: D102
+        if lane == 0:
+            found = self._road(road)
+            held = min(max(s, 0.0), found.length)
+            sides = [p for p in found.lanes if abs(p.number) == 1 and p.s[0] <= held <= p.s[-1]]
+            return float(np.interp(held, sides[-1].s, sides[-1].inner)) if sides else 0.0
         return self._part(road, lane, s)[1]
 
     def drives_along(self, road: str, lane: int) -> bool:  # noqa: D102

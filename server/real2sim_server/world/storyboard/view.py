@@ -521,6 +521,8 @@ class PositionResolver:
         self, road: str, lane: int, s: float, offset: float, orientation: Orientation | None
     ) -> Place:
         place = self.network.place(road, s, self.network.middle(road, lane, s) + offset)
+        if lane == 0:
+            return place._replace(h=self._heading(orientation, place.h))
         way = self.network.way(road, lane, s, along=self.network.drives_along(road, lane))
         driving = way.path.nearest(place.x, place.y).yaw
         return place._replace(h=self._heading(orientation, driving))
