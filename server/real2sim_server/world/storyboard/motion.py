@@ -560,11 +560,11 @@ def _within_road(actor: EntityState, view: View) -> EntityState:
     if beyond <= 0.0:
         return actor
     onward = copy_with(actor, s=end, drift=0.0, route=None).placed().on_lane(view.network)
-    assert onward.way is not None
     change, shift = actor.lateral, onward.offset - actor.offset
     if isinstance(change, OffsetChange):
         change = replace(change, start=change.start + shift, end=change.end + shift)
         onward = copy_with(onward, lateral=change)
+    assert onward.way is not None
     if onward.way.lane and onward.way.length - onward.s > beyond:
         return copy_with(onward, s=onward.s + beyond, drift=actor.drift)
     if way.assigned:
