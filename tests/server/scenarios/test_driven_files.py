@@ -789,6 +789,7 @@ def test_a_relative_speed_has_directions_of_the_triggering_entity(run, condition
         ("", []),
         ('alongRoute="false"', []),
         ('alongRoute="true"', [0.0]),
+        ('alongRoute="true" relativeDistanceType="euclidianDistance"', []),
         ('relativeDistanceType="longitudinal"', [0.0]),
     ],
 )

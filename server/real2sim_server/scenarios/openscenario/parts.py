@@ -453,12 +453,12 @@ def _ruled(part: Part) -> Fields:
 
 
 def _measured(part: Part) -> Fields:
-    """Distance measure; ``alongRoute`` is the attribute of version 1.0."""
+    """Distance measure; newer attributes override ``alongRoute``, that of version 1.0."""
     along = part.flag("alongRoute", False)
     measure = part.choice("relativeDistanceType", MEASURES, "euclidianDistance")
     frame = part.choice("coordinateSystem", FRAMES, "entity")
     part.optional("routingAlgorithm")
-    if along:
+    if along and not {"relativeDistanceType", "coordinateSystem"} & part.raw.attributes.keys():
         measure, frame = "longitudinal", "lane"
     return {"measure": measure, "frame": frame, "freespace": part.flag("freespace", False)}
 

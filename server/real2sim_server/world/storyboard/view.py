@@ -482,17 +482,15 @@ class PositionResolver:
         return self._in_lane(p.road, int(p.lane), float(p.s), float(p.offset), p.orientation)
 
     def _relative_road(self, p: RelativeRoadPosition) -> Place:
-        here, _ = self._where(p.entity)
-        road, _, s, sense = self.network.onward(here.road, here.lane, here.s, float(p.ds))
+        here, along = self._where(p.entity)
+        road, _, s, sense = self._onward(p.entity, here, along, float(p.ds))
         place = self.network.place(road, s, sense * (here.t + float(p.dt)))
         return place._replace(h=self._heading(p.orientation, place.h))
 
     def _relative_lane(self, p: RelativeLanePosition) -> Place:
-        here, along = self._where(p.entity)
-        along = along if p.along == "lane" else 1.0
-        road, lane, s, sense = self.network.onward(
-            here.road, here.lane, here.s, along * float(p.ds)
-        )
+        here, driving = self._where(p.entity)
+        along = driving if p.along == "lane" else 1.0
+        road, lane, s, sense = self._onward(p.entity, here, driving, along * float(p.ds))
         left = sense * along
         lane = self.network.neighbour(road, lane, s, int(p.lanes) * int(left))
         if p.along == "lane":
@@ -500,6 +498,21 @@ class PositionResolver:
         t = self.network.middle(road, lane, s) + left * float(p.offset)
         place = self.network.place(road, s, t)
         return place._replace(h=self._heading(p.orientation, place.h))
+
+    def _onward(
+        self, entity: str, here: RoadPoint, driving: float, ds: float
+    ) -> tuple[str, int, float, float]:
+        """As ``RoadNetwork.onward``, but along the assigned route of an entity that follows one."""
+        actor = self.entities[entity]
+        if actor.way is not None and actor.way.assigned:
+            s = actor.s + driving * ds
+            x, y, _, h = actor.way.path.at(s)
+            x, y = x - actor.offset * math.sin(h), y + actor.offset * math.cos(h)
+            there = self.network.locate(x, y, h) if 0.0 <= s <= actor.way.path.length else None
+            if there is not None:
+                sense = driving * math.copysign(1.0, math.cos(h - there.h))
+                return there.road, there.lane, there.s, sense
+        return self.network.onward(here.road, here.lane, here.s, ds)
 
     def _route(self, p: RoutePosition) -> Place:
         path = self.network.route([self.of(w) for w in p.route.waypoints])

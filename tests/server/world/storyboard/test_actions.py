@@ -443,6 +443,29 @@ def forked() -> LaneGraph:
     return LaneGraph.of(lanes, roads=roads)
 
 
+@pytest.mark.parametrize("kind", [{"kind": "relative_lane"}, {"kind": "relative_road", "dt": 0.0}])
+def test_a_position_ahead_of_an_entity_is_on_its_route(make_world, moving, kind):
+    made = make_world(moving(0, 0, speed=10.0), look=moving(500, 50))
+    scene = replace(made.scene, lanes=forked())
+    places_ = [{"kind": "lane", "road": r, "lane": -1, "s": s} for r, s in (("0", 5), ("left", 45))]
+    ahead = {**kind, "entity": "car", "ds": 50.0}
+    init = [
+        ("car", {"kind": "assign_route", "route": {"waypoints": places_}}),
+        (
+            "car",
+            {"kind": "teleport", "position": {"kind": "lane", "road": "0", "lane": -1, "s": 140}},
+        ),
+    ]
+    given = board(
+        action_at(0.1, {"kind": "teleport", "position": ahead}), init=init, roads={"kind": "map"}
+    )
+    world = World(scene, made.state, ResetSpec(storyboard=given))
+
+    x, y, _ = places(drive(world, 3))[-1]
+    # 50 m ahead of 141 m, and then 0.2 s at 10 m/s.
+    assert (x, y) == pytest.approx((160 + 33 * math.cos(0.3), 33 * math.sin(0.3)), abs=0.01)
+
+
 def test_random_routes_take_each_lane_of_a_fork_equally_often():
     graph, here = forked(), Place(10.0, 0.0, 0.0)
 
