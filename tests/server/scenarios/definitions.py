@@ -190,10 +190,12 @@ def lss_oncoming(ahead: float, speed: float, distance: float, drift: float) -> D
     start = (ahead - CAR_FRONT - EGO_FRONT - distance) / (EGO_SPEED + speed)
     # A sinusoidal change by d has (pi / T)^2 d / 2 as its highest acceleration.
     duration = math.pi * math.sqrt(drift / (2 * 0.8))
-    return Definition(
-        {"drift": start},
-        {"": changing_lane(ahead, start, duration, speed, LANE, LANE - drift, -1.0)},
-    )
+
+    def course(t: float) -> tuple[float, float, float]:
+        # A lane offset leaves the speed along the lane.
+        return ahead - speed * t, LANE - drift * form(t, start, duration), speed
+
+    return Definition({"drift": start}, {"": course})
 
 
 def ccftap(
