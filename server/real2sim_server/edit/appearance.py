@@ -243,19 +243,9 @@ def lamp_cloud(
         size: (length, width, height) of the scaled box [m].
         lamps: the lit lamps.
     """
-    known = _lamp_clouds.setdefault(body, {})
-    key = (scale, size, lamps)
-    if key not in known:
-        known[key] = _lamp_cloud(body, scale, size, lamps)
-    return known[key]
-
-
-def _lamp_cloud(
-    body: GaussianCloud,
-    scale: tuple[float, float, float],
-    size: tuple[float, float, float],
-    lamps: tuple[Lamp, ...],
-) -> GaussianCloud:
+    known, key = _lamp_clouds.setdefault(body, {}), (scale, size, lamps)
+    if key in known:
+        return known[key]
     points = (
         body.means[body.opacities > 0.5].cpu().double() * torch.tensor(scale).double()
     ).numpy()
@@ -278,7 +268,8 @@ def _lamp_cloud(
         opacities=torch.full((count,), 0.99),
         sh=((torch.tensor(colours) - 0.5) / SH_C0)[:, None].contiguous(),
     )
-    return light.to(body.device)
+    known[key] = light.to(body.device)
+    return known[key]
 
 
 def _corners(lamp: Lamp) -> list[tuple[float, float]]:

@@ -685,9 +685,9 @@ class Actions:
         if part.number("transitionTime", 0.0) != 0.0:
             part.ignore_attribute("transitionTime", "lamps change at once")
         if "luminousIntensity" in state.raw.attributes:
-            state.ignore_attribute("luminousIntensity", "lamps have a brightness of their own")
+            state.ignore_attribute("luminousIntensity", "the brightness of lamps is fixed")
         if (colour := state.find("Color")) is not None:
-            colour.ignore("lamps have a colour of their own")
+            colour.ignore("the colour of lamps is fixed")
         return {
             "kind": "light_state",
             "lamp": LAMPS[lamp],
@@ -777,7 +777,7 @@ _NESTED = frozenset(
         "InfrastructureAction", "TrafficSignalAction", "AppearanceAction",
     }
 )  # fmt: skip
-ONLY_LAMPS = "images show brake lamps and indicators"
+ONLY_LAMPS = "of the lights, images only show brake lamps and indicators"
 CONTROLLERS = (
     "the planner drives the ego, and the actions of the file move all others; controllers of other "
     "programs do not run"

@@ -215,7 +215,7 @@ def _lane_change(actor: EntityState, action: LaneChangeAction, at: Beginning) ->
         sense = 1 if math.cos(other.h - base.h) >= 0.0 else -1
         lane = network.neighbour(base.road, base.lane, base.s, lane * sense)
     end = float(action.offset) * (1.0 if along else -1.0)
-    if actor.way is not None and actor.way.assigned:
+    if actor.follows_route:
         end += _offset_of_lane(actor, here, lane, at)
     else:
         actor = actor.on_way(network.way(here.road, lane, here.s, along=along))
@@ -228,7 +228,7 @@ def _lane_change(actor: EntityState, action: LaneChangeAction, at: Beginning) ->
 def _lane_offset(actor: EntityState, action: LaneOffsetAction, at: Beginning) -> EntityState:
     actor, network = _on_lane(actor, at), at.view.network
     base, here = 0.0, network.locate(actor.x, actor.y, actor.h)
-    if here is not None and actor.way is not None and actor.way.assigned:
+    if here is not None and actor.follows_route:
         base = _offset_of_lane(actor, here, here.lane, at)
     else:
         # From now on, offsets of an entity off the road refer to the centre of its lane.
@@ -317,14 +317,17 @@ def _follow_trajectory(
 
 def _assign_route(actor: EntityState, action: AssignRouteAction, at: Beginning) -> EntityState:
     path = at.view.network.route([at.places.of(w) for w in action.route.waypoints])
-    actor = copy_with(actor, route=Way("route", 1, True, path, assigned=True))
-    return _done(actor.on_route() if actor.heads_along(path) else actor, at)
+    route = Way("route", 1, True, path)
+    takes = actor.heads_along(path)
+    return _done(actor.on_route(route) if takes else copy_with(actor, route=route), at)
 
 
 def _random_route(actor: EntityState, action: RandomRouteAction, at: Beginning) -> EntityState:
     way = at.view.network.random_way(Place(actor.x, actor.y, actor.h), actor.name)
-    freed = copy_with(actor, trajectory=None, lateral=None)
-    return _done(freed.on_lane(at.view.network) if way is None else freed.on_way(way), at)
+    if way is not None:
+        return _done(actor.on_route(way), at)
+    off_lanes = copy_with(actor, route=None, trajectory=None, lateral=None)
+    return _done(off_lanes.on_lane(at.view.network), at)
 
 
 def _acquire_position(
@@ -332,7 +335,7 @@ def _acquire_position(
 ) -> EntityState:
     here = Place(actor.x, actor.y, actor.h)
     path = at.view.network.route([here, at.places.of(action.position)])
-    moved = copy_with(actor, route=Way("route", 1, True, path, assigned=True)).on_route()
+    moved = actor.on_route(Way("route", 1, True, path))
     return copy_with(moved, lateral=OffsetChange(
         at.token, "linear", moved.offset, moved.offset, max(path.length - moved.s, 1e-6), True
     ))  # fmt: skip

@@ -552,14 +552,18 @@ def _stretch(actor: EntityState) -> float:
 
 
 def _within_road(actor: EntityState, view: View) -> EntityState:
-    """The entity on the next lane if its path has ended; it stops where there is none."""
+    """The entity on the next lane if its path has ended.
+
+    Without a next lane, it stops at the end of a road, and goes straight on from that of a route.
+    """
     way = actor.way
     assert way is not None
-    end = way.path.length if way.assigned else way.length
+    end = way.path.length if actor.follows_route else way.length
     beyond = actor.s - end
     if beyond <= 0.0:
         return actor
-    onward = copy_with(actor, s=end, drift=0.0, route=None).placed().on_lane(view.network)
+    route = None if actor.follows_route else actor.route
+    onward = copy_with(actor, s=end, drift=0.0, route=route).placed().on_lane(view.network)
     change, shift = actor.lateral, onward.offset - actor.offset
     if isinstance(change, OffsetChange):
         change = replace(change, start=change.start + shift, end=change.end + shift)
@@ -567,7 +571,7 @@ def _within_road(actor: EntityState, view: View) -> EntityState:
     assert onward.way is not None
     if onward.way.lane and onward.way.length - onward.s > beyond:
         return copy_with(onward, s=onward.s + beyond, drift=actor.drift)
-    if way.assigned:
+    if math.isinf(way.length):
         return actor
     return copy_with(actor, s=end, speed=0.0, drift=0.0)
 

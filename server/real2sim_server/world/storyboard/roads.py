@@ -56,14 +56,13 @@ class RoadPoint(NamedTuple):
 
 
 class Way(NamedTuple):
-    """A path to drive along: a lane or an assigned route.
+    """A path to drive along: a lane or a route.
 
     Attributes:
         road, lane: ids; lane 0 is a straight path off the road.
         along: whether it runs in the direction of the reference line.
         path: centre line, in driving direction.
         length: its end along the path [m]; infinite if it does not end.
-        assigned: whether it is an assigned route.
     """
 
     road: str
@@ -71,7 +70,6 @@ class Way(NamedTuple):
     along: bool
     path: LoggedPath
     length: float = math.inf
-    assigned: bool = False
 
 
 class RoadNetwork(Protocol):
@@ -115,7 +113,7 @@ class RoadNetwork(Protocol):
         """The path along lanes through places. Raises WorldError: no such path."""
 
     def random_way(self, place: Place, entity: str) -> Way | None:
-        """The way of an entity along the lane of a place, random at each fork; None off lanes."""
+        """The path along the lane at a place, random at each fork; None off all lanes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -272,7 +270,7 @@ class GraphNetwork:
 
     Attributes:
         graph: lane graph, world frame.
-        draws: random numbers of the episode for random routes; None: they turn least, too.
+        draws: random numbers of the episode for random routes; None: they turn least.
         ways: cache of paths by lane and direction.
     """
 
@@ -409,7 +407,7 @@ class GraphNetwork:
     ) -> Lane | None:
         """The lane that continues a lane; None if it ends.
 
-        At a fork, the share ``u`` of the lanes turns less; 0: the lane turns least.
+        At a fork, ``u`` from 0 to 1 picks one of the lanes, ordered by how far they turn.
         """
         lane, before = self.graph.lane(lane_id), self.graph.predecessors
         names = lane.successors if forwards else before[lane_id]
@@ -420,7 +418,10 @@ class GraphNetwork:
     def _path(
         self, lane_id: str, *, forwards: bool, drawn: Callable[[int], float] | None = None
     ) -> tuple[LoggedPath, float]:
-        """The path along a lane and those that continue it; ``drawn(k)``: see ``u`` of _next."""
+        """The path along a lane and those that continue it.
+
+        ``drawn(k)`` is ``u`` of :meth:`_next` after k lanes; None for the lanes that turn least.
+        """
         lanes, length = [self.graph.lane(lane_id)], 0.0
         while length < REACH:
             length += lanes[-1].length

@@ -93,7 +93,7 @@ class EntityState:
         drift: part of it across the path, positive left [m/s].
         acceleration: along its path [m/s^2].
         way: path that it follows; None for an ego driven by a planner.
-        route: assigned route, which it follows when it is placed near it, or None.
+        route: assigned route, which it follows once it is near and heads along it, or None.
         s, offset: distance along the path, and offset from it [m].
         turn: heading relative to the path, besides that of its drift [rad].
         travelled: distance travelled since the start of the episode [m].
@@ -177,8 +177,9 @@ class EntityState:
         put = copy_with(
             self, x=place.x, y=place.y, h=place.h, z=place.z, drift=0.0, trajectory=None
         )
-        near = self.route is not None and put.heads_along(self.route.path, MAX_ROUTE_OFFSET)
-        put = put.on_route() if near else put.on_lane(network)
+        route = self.route
+        near = route is not None and put.heads_along(route.path, MAX_ROUTE_OFFSET)
+        put = put.on_route(route) if near and route is not None else put.on_lane(network)
         assert put.way is not None
         turn = 0.0 if put.way.lane == 0 else place.h - put.way.path.at(put.s)[3]
         return copy_with(put, turn=math.remainder(turn, math.tau))
@@ -200,10 +201,14 @@ class EntityState:
         away = math.dist((self.x, self.y), near.position[:2])
         return away <= within and abs(math.remainder(near.yaw - self.h, math.tau)) <= ACROSS
 
-    def on_route(self) -> EntityState:
-        """The entity on its assigned route."""
-        assert self.route is not None
-        return copy_with(self, trajectory=None, lateral=None).on_way(self.route)
+    @property
+    def follows_route(self) -> bool:
+        """Whether its path is its route."""
+        return self.route is not None and self.way is self.route
+
+    def on_route(self, route: Way) -> EntityState:
+        """The entity on a route, which becomes its own."""
+        return copy_with(self, route=route, trajectory=None, lateral=None).on_way(route)
 
     def on_way(self, way: Way) -> EntityState:
         """The entity on another path, at its current offset from it."""
@@ -502,9 +507,9 @@ class PositionResolver:
     def _onward(
         self, entity: str, here: RoadPoint, driving: float, ds: float
     ) -> tuple[str, int, float, float]:
-        """As ``RoadNetwork.onward``, but along the assigned route of an entity that follows one."""
+        """As ``RoadNetwork.onward``, but along the route of an entity that follows one."""
         actor = self.entities[entity]
-        if actor.way is not None and actor.way.assigned:
+        if actor.way is not None and actor.follows_route:
             s = actor.s + driving * ds
             x, y, _, h = actor.way.path.at(s)
             x, y = x - actor.offset * math.sin(h), y + actor.offset * math.cos(h)
