@@ -128,7 +128,7 @@ def test_a_log_from_arrays_is_checked_reconstructed_edited_and_driven(
 ) -> None:
     arrays = block("docs/log_format.md", "# What was recorded")
     home.python(arrays + block("docs/log_format.md", "class Recording"))
-    told = home.run("real2sim log-info my_drive --check --all")
+    told = home.run("real2sim log-info my_drive --check")
     assert "no problems found" in told
     home.run("real2sim reconstruct my_drive --out scenes/mine")
     url = serve("serve --scenes scenes --port 0 --data data")

@@ -77,7 +77,7 @@ def test_log_format(page: Callable[[str], Page]) -> None:
         files = re.findall(r"^  (\S+)", tree, re.M)
         assert len(files) == 4
         assert all((formats.folder / "my_drive" / name).exists() for name in files)
-        told = formats.shell("--check --all").splitlines()
+        told = formats.shell("--check").splitlines()
         assert len(list((formats.folder / "pictures").iterdir())) == 4
         assert told[-1] == "no problems found"
         assert told[-2].endswith("contents of 5 images and 5 sweeps read")

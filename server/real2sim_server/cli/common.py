@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import functools
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
-from ..console import CommandError, run_command
+from ..console import CommandError, console, progress, run_command
 
 if TYPE_CHECKING:
-    from ..logs import LogSelection
+    from ..logs import DrivingLog, LogSelection
 
 
 Function = TypeVar("Function", bound=Callable[..., None])
@@ -59,6 +59,9 @@ LogFrames = Annotated[
 LogCameras = Annotated[
     str | None, typer.Option(help="Comma-separated cameras of the log; default: all.")
 ]
+Strict = Annotated[
+    bool, typer.Option("--strict", help="Refuse a log of which anything cannot be used.")
+]
 LogEvery = Annotated[int, typer.Option(min=1, help="Use every Nth frame.")]
 Follow = Annotated[
     bool,
@@ -86,6 +89,43 @@ def log_selection(frames: str, cameras: str | None, every: int) -> LogSelection:
         )
     names = None if cameras is None else tuple(name.strip() for name in cameras.split(","))
     return LogSelection(int(numbers[0] or 0), int(numbers[1]) if numbers[1] else None, every, names)
+
+
+def opened_log(
+    path: Path,
+    log_format: str | None = None,
+    sequence: str | None = None,
+    *,
+    provenance: Mapping[str, Any] | None = None,
+) -> DrivingLog:
+    """The log in a folder without what cannot be used, which is printed.
+
+    Args:
+        path: the folder.
+        log_format: see :func:`~.logs.open_log`.
+        sequence: see :func:`~.logs.open_log`.
+        provenance: of a scene made from a part of the log, which is selected.
+
+    Raises:
+        LogError: see :func:`~.logs.usable_log`.
+    """
+    from ..logs import open_log, same_part, usable_log
+
+    log = open_log(path, format=log_format, sequence=sequence)
+    if provenance is not None:
+        log = same_part(log, provenance)
+    with progress("checking files") as on_progress:
+        log = usable_log(log, on_progress=on_progress)
+    print_left_out(log)
+    return log
+
+
+def print_left_out(log: DrivingLog) -> None:
+    """Print what of a log is not used."""
+    from ..logs.driving_log import left_out_lines
+
+    for line in left_out_lines(log.left_out):
+        console.print(f"left out  {line}", highlight=False, markup=False, soft_wrap=True)
 
 
 # --- Renderer and device -------------------------------------------------------------------------

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ..console import CommandError, console, print_figures, progress, refuse_existing, write_json
-from .common import JsonFile, LogFolder, LogFormat, SequenceName, command
+from .common import JsonFile, LogFolder, LogFormat, SequenceName, Strict, command, opened_log
 
 if TYPE_CHECKING:
     from ..logs import ObjectTrack
@@ -78,45 +78,36 @@ def log_info(
         Path | None, typer.Option("--out", help="Folder for pictures with boxes and LiDAR.")
     ] = None,
     check: Annotated[
-        bool,
-        typer.Option("--check", help="Check the header of every file and list bad files."),
+        bool, typer.Option("--check", help="Read all images and sweeps, not only their headers.")
     ] = False,
-    everything: Annotated[
-        bool, typer.Option("--all", help="Check the whole content of every file.")
-    ] = False,
+    strict: Strict = False,
     log_format: LogFormat = None,
     sequence: SequenceName = None,
     json: JsonFile = None,
 ) -> None:
-    """Summarise a log, draw its boxes and LiDAR, and check its files; exit code 1 for bad files."""
-    from ..logs import check_log, inspect_log, inspected_frames
+    """Summarise a log, say what of it cannot be used, draw its boxes and LiDAR.
+
+    The exit code is 1 if it cannot be reconstructed.
+    """
+    from ..logs import inspect_log
+    from ..logs.check import check_log, leave_out, problems_of
     from ..logs.open import open_log
 
-    opened = open_log(log, format=log_format, sequence=sequence)
-    report = inspect_log(opened, out)
-    lines, checked, problems, shown = report.lines(), None, report.problems, report.problems
-    if check or everything:
+    opened, checked = open_log(log, format=log_format, sequence=sequence), None
+    if check:
         with progress("checking files") as on_progress:
-            checked = check_log(
-                opened,
-                sweeps=None if everything else inspected_frames(opened),
-                decode_images=everything,
-                on_progress=on_progress,
-            )
-        drawn = tuple(text for text in report.problems if text not in checked.problems)
-        problems, shown = drawn + checked.problems, drawn + checked.summary()
-        if checked.empty_sweeps:
-            frames = ", ".join(map(str, checked.empty_sweeps))
-            lines.append(f"question  no points in the sweeps of frames {frames}: are they lost?")
-        more = "" if everything else "; --all reads all contents"
-        lines.append(f"checked   {checked.done()}{more}")
-        if not problems:
-            lines.append("no problems found")
-    lines += [f"problem   {text}" for text in shown]
+            checked = check_log(opened, on_progress=on_progress)
+        opened = leave_out(opened, checked)
+    report = inspect_log(opened, out)
+    problems = [*report.problems, *problems_of(opened, strict=strict)]
+    lines = report.lines()
+    if checked is not None:
+        lines.append(f"checked   {checked.images} images and {checked.sweeps} sweeps read")
+        lines += [] if problems or opened.left_out else ["no problems found"]
+    lines += [f"problem   {text}" for text in problems]
     for line in lines:
         console.print(line, highlight=False, markup=False, soft_wrap=True)
-    check_figures = checked and checked.as_json()
-    write_json(json, {**report.as_json(), "problems": problems, "check": check_figures})
+    write_json(json, {**report.as_json(), "problems": problems})
     if problems:
         raise typer.Exit(1)
 
@@ -148,12 +139,11 @@ def track(
 ) -> None:
     """Detect and track moving objects in a log without boxes."""
     from ..logs import inspect_log
-    from ..logs.open import open_log
     from ..logs.readers.native import write_native_log
     from ..logs.tracking import TrackingOptions, merge_tracks, track_moving_objects
 
     refuse_existing(out, overwrite=False)
-    opened = open_log(log, format=log_format, sequence=sequence)
+    opened = opened_log(log, log_format, sequence)
     options = TrackingOptions(reach=reach, min_distance=min_distance, min_frames=min_frames)
     start = time.perf_counter()
     with progress("tracking") as report:

@@ -17,7 +17,7 @@ from rich.table import Table
 
 from .._files import atomic_file
 from ..console import CommandError, console, errors, print_figures, staged_progress, write_json
-from .common import JsonFile, LogFormat, SequenceName, command
+from .common import JsonFile, LogFormat, SequenceName, command, opened_log
 
 if TYPE_CHECKING:
     from real2sim.planners.learned import PolicyShape
@@ -293,7 +293,6 @@ def _examples(
     log_format: str | None,
     sequence: str | None,
 ) -> tuple[PolicyShape, CloningDataset]:
-    from ..logs import open_log
     from ..policies.cloning import (
         build_dataset,
         exported_examples,
@@ -316,7 +315,7 @@ def _examples(
         ego, shape = scene.ego, _policy_shape(scene.rig, camera)
         images = scene_images(scene, shape, shifted=shifted, seed=seed)
     else:
-        log = open_log(source, format=log_format, sequence=sequence)
+        log = opened_log(source, log_format, sequence)
         ego, shape = log.ego, _policy_shape(log.rig, camera)
         images = log_images(log, shape)
     return shape, build_dataset(ego, shape, _with_progress(images, report))

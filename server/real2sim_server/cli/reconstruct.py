@@ -29,9 +29,12 @@ from .common import (
     RenderDevice,
     SceneBundle,
     SequenceName,
+    Strict,
     chosen_backend,
     command,
     log_selection,
+    opened_log,
+    print_left_out,
 )
 
 if TYPE_CHECKING:
@@ -79,6 +82,7 @@ def reconstruct(
     every: LogEvery = 1,
     log_format: LogFormat = None,
     sequence: SequenceName = None,
+    strict: Strict = False,
     overwrite: Overwrite = False,
     json: JsonFile = None,
 ) -> None:
@@ -101,6 +105,7 @@ def reconstruct(
     if width is not None:
         logged = max((camera.width for camera in opened.rig), default=width)
         training = at_width(training, min(width, logged))
+    print_left_out(opened)
     for question in inspect_log(opened).questions:
         console.print(f"question  {question}", highlight=False, markup=False, soft_wrap=True)
     with staged_progress() as report:
@@ -112,6 +117,7 @@ def reconstruct(
                 training=training if iterations else None,
                 box_noise=box_noise,
                 backend=drawn_by,
+                strict=strict,
             ),
             resume=resume,
             overwrite=overwrite,
@@ -179,7 +185,6 @@ def evaluate(
     json: JsonFile = None,
 ) -> None:
     """Compare a scene with its log: images, moving objects, LiDAR depth, rendering speed."""
-    from ..logs.open import open_log
     from ..reconstruct.evaluation import EvaluateOptions, evaluate_scene, write_report
     from ..scene.io import load_scene
 
@@ -191,7 +196,8 @@ def evaluate(
         around=around,
         lidar=lidar,
     )
-    loaded, opened = load_scene(scene), open_log(log, format=log_format, sequence=sequence)
+    loaded = load_scene(scene)
+    opened = opened_log(log, log_format, sequence, provenance=loaded.provenance)
     with staged_progress() as on_progress:
         result = evaluate_scene(loaded, opened, options=options, on_progress=on_progress)
     print_figures(f"{scene.name} against {opened.name}", _table(result))
@@ -316,12 +322,10 @@ def fit_scene(
     files: FitFiles, what: str, fit: Callable[[Scene, DrivingLog, Callable[..., None]], Fitted]
 ) -> None:
     """Fit ``what`` of a scene, write the bundle and print the figures."""
-    from ..logs import open_log, same_part
     from ..scene.io import load_scene, save_scene
 
     scene = load_scene(files.scene)
-    opened = open_log(files.log, format=files.log_format, sequence=files.sequence)
-    log = same_part(opened, scene.provenance)
+    log = opened_log(files.log, files.log_format, files.sequence, provenance=scene.provenance)
     with staged_progress() as on_progress:
         made, fitted = fit(scene, log, on_progress)
     target = files.scene if files.out is None else files.out

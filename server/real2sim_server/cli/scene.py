@@ -20,6 +20,7 @@ from .common import (
     SequenceName,
     chosen_backend,
     command,
+    opened_log,
 )
 
 if TYPE_CHECKING:
@@ -197,10 +198,9 @@ def _write_image(frame: Frame, modality: str, out: Path) -> None:
 def _compare(
     scene: Scene, log_path: Path, frame: int, camera: str, *, backend: str
 ) -> dict[str, float]:
-    from ..logs import open_log, same_part
     from ..reconstruct.evaluation import evaluate_views
 
-    log = same_part(open_log(log_path), scene.provenance)
+    log = opened_log(log_path, provenance=scene.provenance)
     console.print(
         f"comparing with {log.name}, frame {frame}, over all pixels and over those that LiDAR "
         "covers"
@@ -283,7 +283,6 @@ def ground(
     json: JsonFile = None,
 ) -> None:
     """Compare the ground below a scene's objects with RANSAC planes of LiDAR and Gaussians."""
-    from ..logs.open import open_log
     from ..scene.ground_fit import find_road_plane, ground_points
     from ..scene.io import load_scene
 
@@ -295,7 +294,7 @@ def ground(
     boxes = [(o.trajectory.transform(t_us), o.size) for o in there.values()]
     sources = {"Gaussians": ground_points(loaded.background)}
     if log is not None:
-        sources = {"LiDAR": _lidar_points(open_log(log)), **sources}
+        sources = {"LiDAR": _lidar_points(opened_log(log)), **sources}
     planes = {name: find_road_plane(points, boxes) for name, points in sources.items()}
     figures = (
         {"boxes": len(boxes)} | _plane_figures(planes) | _height_figures(loaded, t_us, sources)
@@ -507,15 +506,12 @@ def _lanes_of(
     reading: tuple[str | None, str | None],
 ) -> tuple[LaneGraph, dict[str, Any]]:
     """The lanes of a map in the scene's frame, or of its log, and figures of how well they fit."""
-    from ..logs import same_part
-    from ..logs.open import open_log
     from ..maps import align, driven_poses, laid_on, lanes_from_log, read_map
 
     if source == "log":
         if log is None:
             raise CommandError("--from log needs the driving log: --log FOLDER")
-        opened = open_log(log, format=reading[0], sequence=reading[1])
-        return lanes_from_log(same_part(opened, scene.provenance)), {}
+        return lanes_from_log(opened_log(log, *reading, provenance=scene.provenance)), {}
     graph = read_map(source)
     if as_it_is:
         return laid_on(graph, scene.ground), {}

@@ -4,7 +4,7 @@ The generator is in ``real2sim_server.synthetic``. It compiles kernels, so this 
 import it.
 """
 
-from .check import LogCheck, check_log
+from .check import LogCheck, check_log, usable_log
 from .driving_log import (
     ChecksFiles,
     DrivingLog,
@@ -41,5 +41,6 @@ __all__ = [
     "open_log",
     "same_part",
     "select_from_log",
+    "usable_log",
     "write_native_log",
 ]

@@ -5,10 +5,9 @@ from __future__ import annotations
 import difflib
 import math
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -16,158 +15,188 @@ from scipy.spatial import cKDTree
 from real2sim_proto.conventions import CLASS_OF_CATEGORY
 
 from ..geometry import Float, apply_transform, invert_transform, quaternion_to_matrix
-from ..scene import Camera, Trajectory
+from ..scene import Camera, CameraRig, Trajectory
 from .drawing import points_in_box
-from .driving_log import ChecksFiles, DrivingLog, LidarSweep, LogError, ObjectTrack, damage_named
+from .driving_log import (
+    ChecksFiles,
+    DrivingLog,
+    LidarSweep,
+    LogError,
+    ObjectTrack,
+    damage_named,
+    left_out_lines,
+)
 
 # --- Files ----------------------------------------------------------------------------------------
 
 MAX_DISTANCE_M = 100_000.0
 """Maximum distance from the world origin [m]; single precision has a resolution of 8 mm there."""
-NAMED_FILES = 5
-"""Maximum number of bad images, and of bad sweeps, to name in a summary."""
+MAX_INCOMPLETE = 0.2
+"""Maximum share of frames without an image or a sweep that the other frames have."""
 
 
 @dataclass(frozen=True)
 class LogCheck:
-    """Scope and findings of :func:`check_log`.
+    """Findings of :func:`check_log`.
 
     Attributes:
-        image_headers, sweep_headers: number of files with a checked header.
-        images, sweeps: number of files read completely.
-        table_problems: problems with times, poses, boxes and cameras, one sentence each.
-        image_problems: one sentence for each bad image; it names the file.
-        sweep_problems: one sentence for each bad sweep; it names the file.
-        empty_sweeps: frames with an empty sweep, if other frames have points.
+        images, sweeps: number of checked files.
+        bad_images: one sentence for each unusable image, by (camera, frame); it names the file.
+        bad_sweeps: one sentence for each unusable sweep, by frame; it names the file. A sweep
+            without points is unusable if other frames have points.
     """
 
-    image_headers: int
-    sweep_headers: int
     images: int
     sweeps: int
-    table_problems: tuple[str, ...]
-    image_problems: tuple[str, ...]
-    sweep_problems: tuple[str, ...]
-    empty_sweeps: tuple[int, ...]
-
-    @property
-    def problems(self) -> tuple[str, ...]:
-        """All problems, one sentence each; empty for a good log."""
-        return (*self.table_problems, *self.image_problems, *self.sweep_problems)
-
-    def as_json(self) -> dict[str, Any]:
-        """The check as JSON values."""
-        return asdict(self)
-
-    def summary(self) -> tuple[str, ...]:
-        """The problems in readable form: number of bad files, the first of them, advice."""
-        lines = list(self.table_problems)
-        for kind, bad, looked_at in (
-            ("image", self.image_problems, max(self.image_headers, self.images)),
-            ("sweep", self.sweep_problems, max(self.sweep_headers, self.sweeps)),
-        ):
-            if bad:
-                lines.append(f"{len(bad)} of {_count(looked_at, kind)} cannot be used:")
-                lines += [f"  {problem}" for problem in bad[:NAMED_FILES]]
-            if len(bad) > NAMED_FILES:
-                lines.append(f"  and {len(bad) - NAMED_FILES} more")
-        if self.image_problems or self.sweep_problems:
-            lines.append("write these files again, or write the log without their frames")
-        return tuple(lines)
-
-    def done(self) -> str:
-        """The checked parts, in words.
-
-        For example "headers of 120 images and 60 sweeps checked, contents of 3 sweeps read".
-        """
-        headers = _listed((self.image_headers, "image"), (self.sweep_headers, "sweep"))
-        contents = _listed((self.images, "image"), (self.sweeps, "sweep"))
-        told = ([f"headers of {headers} checked"] if headers else []) + (
-            [f"contents of {contents} read"] if contents else []
-        )
-        return ", ".join(told) or "there are no files to check"
-
-    def raise_for_problems(self) -> None:
-        """Raise LogError with the :meth:`summary` if there are problems."""
-        if self.problems:
-            raise LogError("\n".join(self.summary()))
-
-
-def _count(number: int, kind: str) -> str:
-    return f"{number} {kind}{'' if number == 1 else 's'}"
-
-
-def _listed(*counts: tuple[int, str]) -> str:
-    return " and ".join(_count(number, kind) for number, kind in counts if number)
+    bad_images: Mapping[tuple[str, int], str]
+    bad_sweeps: Mapping[int, str]
 
 
 def check_log(
     log: DrivingLog,
     *,
-    sweeps: Collection[int] | None = None,
-    decode_images: bool = False,
+    contents: bool = True,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> LogCheck:
     """Check every file of a log; a bad file does not stop the check.
 
-    The header of each image gives its size, and its end mark shows whether it is complete; the
-    header of each sweep lists its arrays. For a source without headers (:class:`ChecksFiles`), all
-    sweeps are read, and images only with ``decode_images``.
+    Args:
+        log: any log.
+        contents: decode every image and read every sweep. Otherwise only headers are read, if the
+            source has them (:class:`ChecksFiles`): the header of each image gives its size, its end
+            mark shows whether it is complete, the header of each sweep lists its arrays.
+        on_progress: called with (done, total) after each frame.
+    """
+    bad_images: dict[tuple[str, int], str] = {}
+    bad_sweeps: dict[int, str] = {}
+    points: dict[int, int | None] = {}
+    images = 0
+    for frame in range(log.frame_count):
+        for camera in log.rig.names:
+            if log.has_image(camera, frame):
+                images += 1
+                try:
+                    _check_image(log, camera, frame, contents=contents)
+                except LogError as error:
+                    bad_images[camera, frame] = str(error)
+        if frame not in log.absent_sweeps:
+            try:
+                points[frame] = _check_sweep(log, frame, contents=contents)
+            except LogError as error:
+                bad_sweeps[frame] = str(error)
+        if on_progress is not None:
+            on_progress(frame + 1, log.frame_count)
+    sweeps = len(points) + len(bad_sweeps)
+    if any(count != 0 for count in points.values()):
+        for frame, count in points.items():
+            if count == 0:
+                bad_sweeps[frame] = f"sweep of frame {frame}: has no points"
+    return LogCheck(images, sweeps, bad_images, dict(sorted(bad_sweeps.items())))
+
+
+def _check_image(log: DrivingLog, camera: str, frame: int, *, contents: bool) -> None:
+    where, t_us = f"image of camera {camera!r} at frame {frame}", log.image_time_us(camera, frame)
+    if not log.ego.covers(t_us):
+        span = f"[{log.ego.start_us}, {log.ego.end_us}] us"
+        raise LogError(f"{where}: was taken at {t_us} us, but ego poses cover {span}")
+    if contents:
+        log.image(camera, frame)
+    elif isinstance(log.source, ChecksFiles):
+        with damage_named(where):
+            log.source.check_image(camera, frame)
+
+
+def _check_sweep(log: DrivingLog, frame: int, *, contents: bool) -> int | None:
+    """Number of points, if known."""
+    if contents:
+        return len(log.lidar(frame).points)
+    if isinstance(log.source, ChecksFiles):
+        with damage_named(f"sweep of frame {frame}"):
+            return log.source.check_sweep(frame)
+    return None
+
+
+def leave_out(log: DrivingLog, check: LogCheck) -> DrivingLog:
+    """``log`` without the bad images and sweeps of ``check``, and cameras without any image."""
+    bad = log.absent_images | check.bad_images.keys()
+    told = {kind: list(sentences) for kind, sentences in log.left_out.items()}
+    cameras, image_times_us = [], dict(log.image_times_us)
+    for camera in log.rig:
+        if all((camera.name, frame) in bad for frame in range(log.frame_count)):
+            reason = next(
+                (t for (name, _), t in check.bad_images.items() if name == camera.name), ""
+            )
+            told.setdefault("cameras", []).append(
+                f"camera {camera.name!r}: has no usable image{reason and f' ({reason})'}"
+            )
+            image_times_us.pop(camera.name, None)
+        else:
+            cameras.append(camera)
+    names = {camera.name for camera in cameras}
+    bad = frozenset((name, frame) for name, frame in bad if name in names)
+    no_sweep = log.absent_sweeps | check.bad_sweeps.keys()
+    for kind, sentences in (
+        ("images", [text for (name, _), text in check.bad_images.items() if name in names]),
+        ("sweeps", list(check.bad_sweeps.values())),
+    ):
+        if sentences:
+            told.setdefault(kind, []).extend(sentences)
+    return replace(
+        log,
+        rig=log.rig if len(cameras) == len(log.rig) else CameraRig(tuple(cameras)),
+        image_times_us=image_times_us,
+        absent_images=bad,
+        absent_sweeps=frozenset(no_sweep),
+        left_out={kind: tuple(sentences) for kind, sentences in told.items()},
+    )
+
+
+def usable_log(
+    log: DrivingLog,
+    *,
+    strict: bool = False,
+    on_progress: Callable[[int, int], None] | None = None,
+) -> DrivingLog:
+    """``log`` without the images and sweeps that cannot be read; reads all of them.
 
     Args:
         log: any log.
-        sweeps: frames with sweeps to read completely, to find values that are not finite; None for
-            all.
-        decode_images: decode every image, to find damage inside files.
+        strict: refuse a log of which anything is left out.
         on_progress: called with (done, total) after each frame.
+
+    Raises:
+        LogError: times, poses or boxes cannot be used, more than a fifth of the frames lack an
+            image or a sweep, or ``strict`` and something is left out. The message lists it.
     """
-    source = log.source if isinstance(log.source, ChecksFiles) else None
-    image_problems: list[str] = []
-    sweep_problems: list[str] = []
-    points: dict[int, int | None] = {}
-    headers = decoded = read = 0
-    for frame in range(log.frame_count):
-        for camera in log.rig.names:
-            try:
-                if decode_images:
-                    decoded += 1
-                    log.image(camera, frame)
-                elif source is not None:
-                    headers += 1
-                    with damage_named(f"image of camera {camera!r} at frame {frame}"):
-                        source.check_image(camera, frame)
-            except LogError as error:
-                image_problems.append(str(error))
-        try:
-            if source is None or sweeps is None or frame in sweeps:
-                read += 1
-                points[frame] = len(log.lidar(frame).points)
-            else:
-                with damage_named(f"sweep of frame {frame}"):
-                    points[frame] = source.check_sweep(frame)
-        except LogError as error:
-            sweep_problems.append(str(error))
-        if on_progress is not None:
-            on_progress(frame + 1, log.frame_count)
-    empty = tuple(frame for frame, count in points.items() if count == 0)
-    return LogCheck(
-        image_headers=headers,
-        # Reading a sweep includes the check of its header.
-        sweep_headers=log.frame_count if read < log.frame_count else 0,
-        images=decoded,
-        sweeps=read,
-        table_problems=(*_cameras(log), *_times(log), *_place(log), *_tracks(log)),
-        image_problems=tuple(image_problems),
-        sweep_problems=tuple(sweep_problems),
-        empty_sweeps=empty if len(empty) < len(points) else (),
-    )
+    rest = leave_out(log, check_log(log, on_progress=on_progress))
+    if found := problems_of(rest, strict=strict):
+        raise LogError("\n".join(found))
+    return rest
+
+
+def problems_of(log: DrivingLog, *, strict: bool = False) -> list[str]:
+    """Reasons why :func:`usable_log` refuses a log, one line each; empty for a good log."""
+    found = [*_cameras(log), *_times(log), *_place(log), *_tracks(log)]
+    lost = len(log.left_out.get("frames", ()))
+    incomplete = len({frame for _, frame in log.absent_images} | log.absent_sweeps) + lost
+    frames = log.frame_count + lost
+    if incomplete > MAX_INCOMPLETE * frames:
+        found += [
+            f"log {log.name!r}: {incomplete} of {frames} frames lack an image, a sweep or a pose; "
+            f"at most {MAX_INCOMPLETE:.0%} may",
+            *left_out_lines(log.left_out),
+            "write these files again, or select other frames or cameras",
+        ]
+    elif strict and log.left_out:
+        found += [f"log {log.name!r} is not complete:", *left_out_lines(log.left_out)]
+    return found
 
 
 def _cameras(log: DrivingLog) -> Iterator[str]:
     if len(log.rig):
         return
-    known = list(log.provenance.get("cameras_without_images", []))
-    named = f"its cameras {known} have no images" if known else "it has no cameras"
+    known = log.left_out.get("cameras", ())
+    named = f"it has no usable camera ({'; '.join(known)})" if known else "it has no cameras"
     yield (
         f"log {log.name!r} cannot be trained on: {named}; put the images where the data set has "
         "them (LiDAR and boxes can be used as they are)"
@@ -184,11 +213,6 @@ def _times(log: DrivingLog) -> Iterator[str]:
             yield (
                 f"log {log.name!r}: camera {camera!r} has {len(given)} image times for "
                 f"{len(times)} frames"
-            )
-        for t_us in given[~np.array([log.ego.covers(int(t)) for t in given], bool)][:1]:
-            yield (
-                f"log {log.name!r}: ego poses cover [{log.ego.start_us}, {log.ego.end_us}] us, "
-                f"but camera {camera!r} takes an image at {t_us} us"
             )
 
 
@@ -272,7 +296,7 @@ def questions_to(log: DrivingLog, sweeps: Mapping[int, LidarSweep]) -> list[str]
     if not sweeps:
         return found
     if not any(len(s.points) for s in sweeps.values()):
-        return [*found, "there is no LiDAR: nothing to start a reconstruction from"]
+        return [*found, "there is no LiDAR: depths come from what images have in common"]
     if not log.tracks:
         found.append("there are no boxes: moving objects have to be tracked first")
     found += [*_intensity(sweeps), *_ground(sweeps), *_boxes(log, sweeps), *_standing(log, sweeps)]
@@ -302,15 +326,6 @@ def _odd_times(log: DrivingLog) -> list[str]:
         unit = "milliseconds or seconds" if rate > MAX_RATE else "nanoseconds"
         return [f"{rate:.4g} frames a second: are times in {unit}? They must be in microseconds"]
     found = [f"{s:.2f} s pass after frame {i}: are frames missing?" for i, s in gaps_between(steps)]
-    without = log.provenance.get("cameras_without_images")
-    if without:
-        found.append(f"cameras without images, left out: {', '.join(without)}")
-    lost = [t * 1e-6 for t in log.provenance.get("frames_without_sweep_us", ())]
-    if lost:
-        found.append(
-            f"frames without a LiDAR sweep, left out: {len(lost)}, at "
-            f"{', '.join(f'{t:.2f}' for t in lost[:5])}{' ...' if len(lost) > 5 else ''} s"
-        )
     speed = ego_steps(log) / steps
     if speed.max() > MAX_EGO_SPEED:
         frame = int(speed.argmax())

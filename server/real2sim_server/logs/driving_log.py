@@ -14,6 +14,20 @@ from numpy.typing import NDArray
 from ..geometry import Float
 from ..scene import CameraRig, LaneGraph, Trajectory
 
+NAMED = 5
+"""Maximum number of records of a kind to name in a summary."""
+
+
+def left_out_lines(left_out: Mapping[str, Sequence[str]]) -> list[str]:
+    """What a log leaves out: for each kind a line with the number, then the first five."""
+    lines = []
+    for kind, sentences in left_out.items():
+        lines.append(f"{len(sentences)} {kind}:")
+        lines += [f"  {sentence}" for sentence in sentences[:NAMED]]
+        if len(sentences) > NAMED:
+            lines.append(f"  and {len(sentences) - NAMED} more")
+    return lines
+
 
 class LogError(ValueError):
     """A log that cannot be read; the message names the file, the problem and the expectation."""
@@ -36,6 +50,14 @@ class LidarSweep:
     intensity: NDArray[np.float32]
     offset_us: NDArray[np.int32]
     origin: NDArray[np.float32]
+
+
+NO_SWEEP = LidarSweep(
+    points=np.zeros((0, 3), np.float32),
+    intensity=np.zeros(0, np.float32),
+    offset_us=np.zeros(0, np.int32),
+    origin=np.zeros(3, np.float32),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,6 +163,10 @@ class DrivingLog:
         provenance: dataset, sequence, licence, reader (JSON values only).
         image_times_us: [F] int64 [us] by camera, actual times of its images if they differ from the
             frame's time stamp; see :meth:`image_time_us`.
+        absent_images: (camera, frame) without a usable image.
+        absent_sweeps: frames without a usable sweep.
+        left_out: by kind (``images``, ``sweeps``, ``frames``, ``boxes``, ...), a sentence for each
+            record of the files that the log does not use.
         lanes: lanes of the log's map, in its world frame; None without a map.
         logged_map: location of a map that has not been read; None without one.
     """
@@ -154,6 +180,9 @@ class DrivingLog:
     ego_size: tuple[float, float, float] = (4.6, 1.85, 1.6)
     provenance: Mapping[str, Any] = field(default_factory=dict)
     image_times_us: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)
+    absent_images: frozenset[tuple[str, int]] = frozenset()
+    absent_sweeps: frozenset[int] = frozenset()
+    left_out: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     lanes: LaneGraph | None = field(default=None, repr=False)
     logged_map: LoggedMap | None = field(default=None, repr=False)
 
@@ -166,12 +195,15 @@ class DrivingLog:
         """RGB uint8 [H, W, 3] of ``camera`` at ``frame``, the camera's size.
 
         Raises:
-            LogError: the image is missing, broken or of another size.
+            LogError: the image is absent (see :meth:`has_image`), broken or of another size.
         """
-        if camera in self.provenance.get("cameras_without_images", ()):
-            raise LogError(f"log {self.name!r}: camera {camera!r} has no images")
         expected = self.rig[camera]
         checked = self._checked(frame)
+        if not self.has_image(camera, frame):
+            raise LogError(
+                f"log {self.name!r}: camera {camera!r} has no usable image at frame {frame}; "
+                "left_out tells why, has_image() tells which are there"
+            )
         with damage_named(f"log {self.name!r}: image of camera {camera!r} at frame {frame}"):
             image = self.source.image(camera, checked)
         if image.shape != (expected.height, expected.width, 3):
@@ -180,6 +212,15 @@ class DrivingLog:
                 f"its calibration says ({expected.height}, {expected.width}, 3)"
             )
         return image
+
+    def has_image(self, camera: str, frame: int) -> bool:
+        """Whether ``camera`` has a usable image at ``frame``."""
+        return (camera, frame) not in self.absent_images
+
+    def seen_frames(self) -> list[int]:
+        """Frames with a usable image of at least one camera."""
+        names = self.rig.names
+        return [f for f in range(self.frame_count) if any(self.has_image(n, f) for n in names)]
 
     def image_time_us(self, camera: str, frame: int) -> int:
         """Time of the image of ``camera`` in ``frame`` [us], covered by ``ego``.
@@ -191,12 +232,14 @@ class DrivingLog:
         return int(times[self._checked(frame)])
 
     def lidar(self, frame: int) -> LidarSweep:
-        """The LiDAR sweep of ``frame``; it may be empty.
+        """The LiDAR sweep of ``frame``; without points if it is absent.
 
         Raises:
-            LogError: the sweep is missing or broken.
+            LogError: the sweep is broken.
         """
         checked = self._checked(frame)
+        if frame in self.absent_sweeps:
+            return NO_SWEEP
         with damage_named(f"log {self.name!r}: sweep of frame {frame}"):
             return self.source.lidar(checked)
 
@@ -249,6 +292,7 @@ def select_from_log(log: DrivingLog, selection: LogSelection) -> DrivingLog:
     frames = _frames(log, selection)
     rig = _cameras(log, selection.cameras)
     part = log_of_frames(log, frames)
+    absent = frozenset((name, frame) for name, frame in part.absent_images if name in rig.names)
     image_times_us = {k: taken for k, taken in part.image_times_us.items() if k in rig.names}
     instants = np.concatenate([part.frame_times_us, *image_times_us.values()])
     start_us, end_us = int(instants.min()), int(instants.max())
@@ -262,6 +306,7 @@ def select_from_log(log: DrivingLog, selection: LogSelection) -> DrivingLog:
             if _is_there(track, start_us, end_us)
         ),
         image_times_us=image_times_us,
+        absent_images=absent,
         provenance={
             **log.provenance,
             SELECTION: _told(log, frames, selection.cameras),
@@ -289,8 +334,13 @@ def log_of_frames(log: DrivingLog, frames: Sequence[int]) -> DrivingLog:
     """``log`` with only these frames. Paths and boxes stay complete."""
     index = np.asarray(frames, np.int64)
     selected = _SelectedFiles if isinstance(log.source, ChecksFiles) else _SelectedFrames
+    new = list(enumerate(frames))
     return replace(
         log,
+        absent_images=frozenset(
+            (name, i) for i, f in new for name in log.rig.names if not log.has_image(name, f)
+        ),
+        absent_sweeps=frozenset(i for i, f in new if f in log.absent_sweeps),
         frame_times_us=log.frame_times_us[index],
         source=selected(log, frames),
         image_times_us={name: taken[index] for name, taken in log.image_times_us.items()},

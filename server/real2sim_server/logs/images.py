@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import struct
+from collections import Counter
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +34,26 @@ def image_size(path: Path) -> tuple[int, int]:
     except OSError as error:
         raise LogError(f"{path}: cannot be read as an image ({error})") from error
     return encoded_size(head, str(path))
+
+
+def common_size(files: Iterable[Path]) -> tuple[int, int]:
+    """(width, height) [px] of most of the readable images, from the headers of the first 20.
+
+    Raises:
+        LogError: none of the files is an image.
+    """
+    sizes: Counter[tuple[int, int]] = Counter()
+    error: LogError | None = None
+    for path in files:
+        try:
+            sizes[image_size(path)] += 1
+        except LogError as found:
+            error = error or found
+        if sizes.total() == 20:
+            break
+    if not sizes:
+        raise error or LogError("there are no images")
+    return sizes.most_common(1)[0][0]
 
 
 def encoded_size(data: bytes, where: str) -> tuple[int, int]:

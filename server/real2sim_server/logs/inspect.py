@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from .check import ego_steps, gaps_between, questions_to
 from .drawing import draw_frame, draw_top_view
-from .driving_log import DrivingLog, LidarSweep, LogError
+from .driving_log import DrivingLog, LidarSweep, LogError, left_out_lines
 from .images import write_image
 
 INSPECTED_FRAMES = 3
@@ -49,6 +49,7 @@ class LogReport:
         moving: number of moving objects by category.
         ego_distance: driven distance [m].
         ego_speed: maximum speed [m/s].
+        left_out: by kind, one sentence for each record of the files that the log does not use.
         questions: suspicious properties, in plain words; empty for a good log.
         problems: unreadable parts of the inspected frames, one sentence each.
         drawings: files that were written.
@@ -70,6 +71,7 @@ class LogReport:
     moving: dict[str, int]
     ego_distance: float
     ego_speed: float
+    left_out: Mapping[str, tuple[str, ...]]
     questions: tuple[str, ...]
     problems: tuple[str, ...]
     drawings: tuple[str, ...] = field(default=())
@@ -98,15 +100,18 @@ class LogReport:
             f"objects   {count} {category} ({self.moving.get(category, 0)} moving)"
             for category, count in self.tracks.items()
         ] or ["objects   none"]
+        lines += [f"left out  {text}" for text in left_out_lines(self.left_out)]
         lines += [f"question  {text}" for text in self.questions]
         lines += [f"drawing   {file}" for file in self.drawings]
         return lines
 
 
 def inspected_frames(log: DrivingLog) -> tuple[int, ...]:
-    """The frames that :func:`inspect_log` reads: first, middle and last."""
-    chosen = np.linspace(0, log.frame_count - 1, INSPECTED_FRAMES).tolist()
-    return tuple(sorted({round(i) for i in chosen}))
+    """The frames that :func:`inspect_log` reads: first, middle and last of the complete ones."""
+    frames = [f for f in log.seen_frames() if f not in log.absent_sweeps]
+    frames = frames or list(range(log.frame_count))
+    chosen = np.linspace(0, len(frames) - 1, INSPECTED_FRAMES).tolist()
+    return tuple(sorted({frames[round(i)] for i in chosen}))
 
 
 def inspect_log(log: DrivingLog, out: str | Path | None = None) -> LogReport:
@@ -146,6 +151,7 @@ def inspect_log(log: DrivingLog, out: str | Path | None = None) -> LogReport:
         moving=dict(sorted(Counter(t.category for t in moving).items())),
         ego_distance=float(ego_steps(log).sum()),
         ego_speed=float((ego_steps(log) / steps).max()) if len(steps) else 0.0,
+        left_out=log.left_out,
         questions=tuple(questions_to(log, sweeps)),
         drawings=() if out is None else tuple(_draw(log, sweeps, Path(out), problems)),
         problems=tuple(problems),
@@ -179,6 +185,8 @@ def _draw(
     for frame in sweeps:
         pictures = []
         for name in log.rig.names:
+            if not log.has_image(name, frame):
+                continue
             try:
                 pictures.append(draw_frame(log, name, frame))
             except LogError as error:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from .check import check_log, leave_out
 from .driving_log import DrivingLog, LogError, damage_named
 from .readers import READERS, LogReader
 
@@ -12,6 +13,9 @@ def open_log(
     path: str | Path, *, format: str | None = None, sequence: str | None = None
 ) -> DrivingLog:
     """Open the driving log in a folder.
+
+    The headers of all images and sweeps are checked. Images, sweeps and other records that cannot
+    be used are left out, and ``left_out`` of the log lists them.
 
     Args:
         path: the log's folder.
@@ -26,7 +30,8 @@ def open_log(
         raise LogError(f"{folder}: no such folder; a log is a folder\n{_known_formats()}")
     reader = _reader_for(folder, format)
     with damage_named(f"{folder} ({reader.name})"):
-        return reader.read(folder, sequence=sequence)
+        log = reader.read(folder, sequence=sequence)
+        return leave_out(log, check_log(log, contents=False))
 
 
 def _reader_for(folder: Path, format_name: str | None) -> LogReader:

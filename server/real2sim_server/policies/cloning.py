@@ -60,6 +60,8 @@ class PosedImage:
 def log_images(log: DrivingLog, shape: PolicyShape) -> Iterator[PosedImage]:
     """The images of a log."""
     for frame in range(log.frame_count):
+        if not log.has_image(shape.camera, frame):
+            continue
         t_us = log.image_time_us(shape.camera, frame)
         pose = transform_from(*log.ego.pose(t_us))
         yield PosedImage(log.image(shape.camera, frame), t_us, pose, frame, log.frame_count)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..logs import DrivingLog, open_log
+from ..logs import DrivingLog, open_log, usable_log
 from ..render.images import write_png
 from ..render.select import select_backend
 from ..scene import Scene
@@ -63,6 +63,7 @@ class ReconstructReport:
         scene: folder of the bundle.
         preview: PNG of a logged image above its rendered view.
         frames, cameras: numbers of frames and cameras of the log.
+        left_out: number of records of the log that were not used, by kind.
         objects: number of objects.
         gaussians: number in background and objects.
         background_gaussians: number in the background.
@@ -88,6 +89,7 @@ class ReconstructReport:
     evaluated_frames: list[int]
     total_s: float
     timing_s: dict[str, float] = field(default_factory=dict)
+    left_out: dict[str, int] = field(default_factory=dict)
     training: TrainingFigures | None = None
 
 
@@ -101,12 +103,14 @@ class ReconstructOptions:
         box_noise: noise added to the boxes of the log, for measuring its correction by training;
         see ``with_box_noise``.
         backend: backend of the renderer; training runs on its device.
+        strict: refuse a log of which anything is left out.
     """
 
     initialise: InitialiseOptions | None = None
     training: TrainOptions | None = None
     box_noise: float = 0.0
     backend: str = "auto"
+    strict: bool = False
 
 
 def reconstruct(
@@ -135,7 +139,7 @@ def reconstruct(
 
     Raises:
         ReconstructError: the log has nothing to build from, or there is nothing to resume.
-        LogError: the log cannot be read.
+        LogError: the log cannot be read, or too much of it is left out; see :func:`usable_log`.
         BundleError: ``out`` exists and ``overwrite`` is false.
         RenderError: the renderer is not usable here; raised before anything is read.
     """
@@ -147,6 +151,8 @@ def reconstruct(
     stages = Stages(on_progress, timing_s)
     with stages("open"):
         log = log if isinstance(log, DrivingLog) else open_log(Path(log))
+    with stages("check") as report_step:
+        log = usable_log(log, strict=options.strict, on_progress=report_step)
         if options.box_noise > 0:
             log = with_box_noise(log, options.box_noise)
     figures = None
@@ -189,6 +195,7 @@ def reconstruct(
         evaluated_frames=frames,
         total_s=sum(timing_s.values()),
         timing_s=timing_s,
+        left_out={kind: len(sentences) for kind, sentences in log.left_out.items()},
         training=figures,
     )
 
@@ -244,7 +251,8 @@ def _train(
 
 def _evaluated_frames(log: DrivingLog, figures: TrainingFigures | None) -> list[int]:
     """A few frames spread over the log, held-out ones if available."""
-    held_out = figures.held_out_frames if figures else []
+    seen = set(log.seen_frames())
+    held_out = [frame for frame in figures.held_out_frames if frame in seen] if figures else []
     if not held_out:
         return chosen_frames(log, EVALUATED_FRAMES)
     return held_out[:: -(-len(held_out) // EVALUATED_FRAMES)]
@@ -252,7 +260,7 @@ def _evaluated_frames(log: DrivingLog, figures: TrainingFigures | None) -> list[
 
 def _write_preview(scene: Scene, log: DrivingLog, out: Path, frame: int, *, backend: str) -> Path:
     """The logged image of the first camera above the rendered one."""
-    camera = log.rig.cameras[0]
+    camera = next(camera for camera in log.rig if log.has_image(camera.name, frame))
     t_us = int(log.frame_times_us[frame])
     rendered = render_logged_view(scene, camera, t_us, backend=backend)
     path = out.parent / f"{out.name}.preview.png"

@@ -6,6 +6,7 @@ import importlib.util
 import shutil
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import cv2
 import numpy as np
@@ -35,24 +36,6 @@ def tiny_log() -> SyntheticLog:
     return generate_log(TINY)
 
 
-@pytest.fixture(scope="session")
-def written_native(tiny_log: SyntheticLog, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_native_log(tiny_log, tmp_path_factory.mktemp("native") / "drive")
-
-
-@pytest.fixture(scope="session")
-def written_kitti(tiny_log: SyntheticLog, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("kitti") / "root"
-    _write_kitti_layout(tiny_log, folder / "training", sequence="0007")
-    return folder
-
-
-@pytest.fixture(scope="session")
-def written_waymo_v2(tiny_log: SyntheticLog, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("waymo_v2") / "root"
-    return write_waymo_v2(tiny_log, folder, segment="tiny_0_20")
-
-
 def _layout(name: str) -> ModuleType:
     """Import a module of ``layouts``, since test folders are not packages."""
     path = Path(__file__).parent / "layouts" / f"{name}.py"
@@ -64,57 +47,49 @@ def _layout(name: str) -> ModuleType:
     return module
 
 
+def write_layout(name: str, log: DrivingLog, folder: Path) -> Path:
+    """Write a log in the layout of a reader. Returns the folder to open."""
+    if name == "native":
+        return write_native_log(log, folder / "drive")
+    if name == "kitti":
+        _write_kitti_layout(log, folder / "root/training", sequence="0007")
+        return folder / "root"
+    if name == "kitti_raw":
+        tracking = write_layout("kitti", log, folder / "tracking")
+        _layout(name).write(log, tracking, folder / "raw")
+        return folder / "raw"
+    if name == "waymo_v2":
+        return write_waymo_v2(log, folder / "root", segment="tiny_0_20")
+    if name == "waymo_v1":
+        _layout(name).write(log, folder / "tiny.tfrecord")
+        return folder
+    target = folder / {"argoverse2": "7fab2350", "street_gaussians": "002", "drivestudio": "023",
+                       "nuscenes": "set"}[name]  # fmt: skip
+    _layout(name).write(log, target)
+    return target
+
+
+def _written(name: str) -> Any:
+    def write(tiny_log: SyntheticLog, tmp_path_factory: pytest.TempPathFactory) -> Path:
+        return write_layout(name, tiny_log, tmp_path_factory.mktemp(name))
+
+    return pytest.fixture(scope="session", name=f"written_{name}")(write)
+
+
+written_native = _written("native")
+written_kitti = _written("kitti")
+written_kitti_raw = _written("kitti_raw")
+written_waymo_v1 = _written("waymo_v1")
+written_waymo_v2 = _written("waymo_v2")
+written_argoverse2 = _written("argoverse2")
+written_nuscenes = _written("nuscenes")
+written_street_gaussians = _written("street_gaussians")
+written_drivestudio = _written("drivestudio")
+
+
 @pytest.fixture(scope="session")
 def waymo_v1() -> ModuleType:
     return _layout("waymo_v1")
-
-
-@pytest.fixture(scope="session")
-def written_waymo_v1(
-    waymo_v1: ModuleType, tiny_log: SyntheticLog, tmp_path_factory: pytest.TempPathFactory
-) -> Path:
-    folder = tmp_path_factory.mktemp("waymo_v1")
-    waymo_v1.write(tiny_log, folder / "tiny.tfrecord")
-    return folder
-
-
-@pytest.fixture(scope="session")
-def written_argoverse2(tiny_log: SyntheticLog, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("argoverse2") / "7fab2350"
-    _layout("argoverse2").write(tiny_log, folder)
-    return folder
-
-
-@pytest.fixture(scope="session")
-def written_kitti_raw(
-    tiny_log: SyntheticLog, written_kitti: Path, tmp_path_factory: pytest.TempPathFactory
-) -> Path:
-    folder = tmp_path_factory.mktemp("kitti_raw")
-    _layout("kitti_raw").write(tiny_log, written_kitti, folder)
-    return folder
-
-
-@pytest.fixture(scope="session")
-def written_nuscenes(tiny_log: SyntheticLog, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("nuscenes")
-    _layout("nuscenes").write(tiny_log, folder)
-    return folder
-
-
-@pytest.fixture(scope="session")
-def written_street_gaussians(
-    tiny_log: SyntheticLog, tmp_path_factory: pytest.TempPathFactory
-) -> Path:
-    folder = tmp_path_factory.mktemp("street") / "002"
-    _layout("street_gaussians").write(tiny_log, folder)
-    return folder
-
-
-@pytest.fixture(scope="session")
-def written_drivestudio(tiny_log: SyntheticLog, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("drivestudio") / "023"
-    _layout("drivestudio").write(tiny_log, folder)
-    return folder
 
 
 @pytest.fixture

@@ -16,6 +16,15 @@ from real2sim_server.logs import DrivingLog, LogError, open_log
 from real2sim_server.logs.readers import READERS
 
 
+def told_about(folder: Path) -> tuple[bool, str]:
+    """Whether a log is refused, and all that is said about what cannot be used."""
+    try:
+        log = open_log(folder)
+    except LogError as error:
+        return True, str(error)
+    return False, "\n".join(text for texts in log.left_out.values() for text in texts)
+
+
 class ReaderContract:
     """Tests of a reader with a folder in its layout."""
 

@@ -101,8 +101,9 @@ def test_boxes_in_another_frame_are_found(tiny_log: SyntheticLog) -> None:
 def test_missing_parts_are_named(tiny_log: SyntheticLog, written_argoverse2: Path) -> None:
     log = dataclasses.replace(tiny_log, tracks=())
     assert any("no boxes" in p for p in inspect_log(log).questions)
-    questions = inspect_log(open_log(written_argoverse2)).questions
-    assert questions == ("cameras without images, left out: ring_rear_left",)
+    report = inspect_log(open_log(written_argoverse2))
+    assert not report.questions
+    assert report.left_out == {"cameras": ("camera 'ring_rear_left': has no images",)}
 
 
 def test_drawings_are_written(tiny_log: SyntheticLog, tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 import shutil
 from pathlib import Path
 from types import ModuleType
@@ -7,11 +8,10 @@ from types import ModuleType
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
-from typer.testing import CliRunner
 
-from real2sim.cli import build_app
 from real2sim_server.geometry import apply_transform, invert_transform
 from real2sim_server.logs import DrivingLog, LogError, ObjectTrack, open_log
+from real2sim_server.logs.readers.common import LeftOut
 from real2sim_server.logs.readers.waymo_v1 import (
     ProtoMessage,
     list_records,
@@ -149,7 +149,7 @@ def test_sample_boxes_project_like_the_dataset_labels(sample: DrivingLog, test_d
 def _published_bounds(path: Path) -> list[tuple[str, str, list[float]]]:
     """Camera, track and bounds (left, top, right, bottom) of ``projected_lidar_labels``."""
     names = {1: "front", 2: "front_left", 3: "front_right", 4: "side_left", 5: "side_right"}
-    frame = ProtoMessage(read_record(path, list_records(path)[0]), "frame")
+    frame = ProtoMessage(read_record(path, list_records(path, LeftOut())[0]), "frame")
     found = []
     for camera in frame.messages(9, "labels"):
         for label in camera.messages(2, "label"):
@@ -167,20 +167,19 @@ def _corners_in_camera(log: DrivingLog, camera: str, track: ObjectTrack) -> np.n
     return apply_transform(to_camera, signs * np.array(track.size))
 
 
-def test_a_frame_without_a_sweep_is_omitted_and_reported(
+def test_a_frame_without_a_sweep_keeps_its_images(
     waymo_v1: ModuleType, tiny_log: SyntheticLog, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     laser = waymo_v1._laser
     monkeypatch.setattr(waymo_v1, "_laser", lambda log, f: b"" if f == 1 else laser(log, f))
     waymo_v1.write(tiny_log, tmp_path / "tiny.tfrecord")
     log = open_log(tmp_path)
-    assert log.frame_times_us.tolist() == tiny_log.frame_times_us[[0, 2]].tolist()
-    for ours, frame in enumerate((0, 2)):
-        assert len(log.lidar(ours).points) > 1000
-        assert (log.image("front", ours) == tiny_log.image("front", frame)).all()
-    told = CliRunner().invoke(build_app(), ["log-info", str(tmp_path), "--check"])
-    assert told.exit_code == 0, told.output
-    assert "frames without a LiDAR sweep, left out: 1, at 0.10 s" in told.output
+    assert log.absent_sweeps == {1}
+    for frame in range(3):
+        assert (len(log.lidar(frame).points) > 1000) == (frame != 1)
+        assert (log.image("front", frame) == tiny_log.image("front", frame)).all()
+    (told,) = log.left_out["sweeps"]
+    assert "has no sweep of the TOP laser" in told
 
 
 def test_broken_record_is_named(folder: Path) -> None:
@@ -188,15 +187,19 @@ def test_broken_record_is_named(folder: Path) -> None:
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 0xFF
     path.write_bytes(data)
-    with pytest.raises(LogError, match=r"tiny\.tfrecord: the record at byte \d+ is broken"):
-        open_log(folder)
+    log = open_log(folder)
+    assert log.frame_count == 2
+    (told,) = log.left_out["frames"]
+    assert re.search(r"tiny\.tfrecord: the record at byte \d+ is broken", told)
 
 
 def test_truncated_file_is_named(folder: Path) -> None:
     path = folder / "tiny.tfrecord"
     path.write_bytes(path.read_bytes()[:-100])
-    with pytest.raises(LogError, match=r"tiny\.tfrecord at byte \d+: .*cut off"):
-        open_log(folder)
+    log = open_log(folder)
+    assert log.frame_count == 2
+    (told,) = log.left_out["ends of files"]
+    assert re.search(r"tiny\.tfrecord at byte \d+: .*cut off", told)
 
 
 def test_unrelated_file_is_named(folder: Path) -> None:

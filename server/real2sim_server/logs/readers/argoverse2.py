@@ -18,10 +18,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...geometry import Float, invert_transform, transform_from
-from ...scene import CameraRig, SceneError, Trajectory
+from ...scene import CameraRig, Trajectory
 from ..driving_log import DrivingLog, LidarSweep, LogError, LoggedMap, ObjectTrack
-from .common import FrameBox, Lens, TimedImages, build_tracks, match_images, select_sequence
-from .files import ImageFiles, check_ego_covers, check_feather, check_frame_times, read_feather
+from .common import (
+    FrameBox,
+    LeftOut,
+    Lens,
+    TimedImages,
+    build_tracks,
+    covered_frames,
+    match_images,
+    select_sequence,
+)
+from .files import ImageFiles, check_feather, read_feather
 
 AXLE_HEIGHT = 0.33
 """Height of the ego frame above the road [m], from the user guide."""
@@ -30,7 +39,8 @@ EGO_SIZE = (4.87, 1.85, 1.48)
 """Ford Fusion Hybrid without its roof sensors [m]."""
 
 IMAGE_TOLERANCE_US = 60_000
-LEFT_OUT = ("stereo_",)
+MAX_DIGITS = 18
+NOT_READ = ("stereo_",)
 """Grey cameras with a quarter of the frame rate of the others."""
 
 CATEGORIES = {
@@ -68,35 +78,47 @@ class Argoverse2Reader:
     def read(self, path: Path, *, sequence: str | None = None) -> DrivingLog:
         """The log ``sequence``; the only one by default.
 
-        Every sweep is a frame; frames without images at both ends are dropped. Cameras without any
-        image, and the stereo pair, are dropped and named in the provenance.
+        Every sweep is a frame. Cameras without any image are left out; the stereo pair is not read.
 
         Raises:
             LogError: see :class:`LogReader`.
         """
         logs = _logs(path)
         folder = logs[select_sequence(path, sorted(logs), sequence)]
-        sweeps, times_us = _list_sweeps(folder / "sensors" / "lidar")
-        city = _read_ego(folder / "city_SE3_egovehicle.feather")
-        check_ego_covers(city, times_us, str(folder / "city_SE3_egovehicle.feather"))
-        lenses, mounts = _read_calibration(folder / "calibration")
-        images, without = _list_images(folder / "sensors" / "cameras", sorted(lenses))
-        frames, files, image_times = np.arange(len(times_us)), {}, {}
-        if images:
-            matched = match_images(times_us, images, tolerance_us=IMAGE_TOLERANCE_US, where=folder)
-            frames, files, image_times = matched.frames, matched.files, matched.times_us
-        source = _Argoverse2Source(
-            ImageFiles(files, {name: lenses[name] for name in files}),
-            [sweeps[i] for i in frames],
-            mounts["up_lidar"][:3, 3],
+        left_out = LeftOut()
+        sweeps = _recordings(folder / "sensors" / "lidar", ".feather", left_out)
+        if sweeps is None:
+            raise LogError(f"{folder / 'sensors' / 'lidar'}: holds no sweeps <ns>.feather")
+        where = folder / "city_SE3_egovehicle.feather"
+        city = _read_ego(where, left_out)
+        lenses, mounts = _read_calibration(folder / "calibration", left_out)
+        images = {}
+        for name in sorted(lenses):
+            if name.startswith(NOT_READ):
+                continue
+            found = _recordings(folder / "sensors" / "cameras" / name, ".jpg", left_out)
+            if found is not None:
+                images[name] = found
+            else:
+                left_out.add("cameras", f"camera {name!r}: has no images")
+        frames = covered_frames(city, sweeps.times_us, left_out, str(where))
+        times_us = sweeps.times_us[frames]
+        matched = match_images(
+            times_us, images, tolerance_us=IMAGE_TOLERANCE_US, left_out=left_out, where=folder
         )
-        T_world_city = invert_transform(city.transform(int(times_us[frames[0]])))
+        has_lidar = "up_lidar" in mounts
+        source = _Argoverse2Source(
+            ImageFiles(matched.files, lenses),
+            [sweeps.files[k] for k in frames],
+            mounts["up_lidar"][:3, 3] if has_lidar else np.zeros(3),
+        )
+        T_world_city = invert_transform(city.transform(int(times_us[0])))
         ego = city.moved(T_world_city)
-        tracks, keys = _read_tracks(folder / "annotations.feather", ego)
+        tracks, keys = _read_tracks(folder / "annotations.feather", ego, sweeps.times_us, left_out)
         return DrivingLog(
             name=f"argoverse2_{folder.name}",
-            rig=_rig(files, lenses, mounts),
-            frame_times_us=times_us[frames],
+            rig=CameraRig(tuple(lenses[n].camera(n, mounts[n]) for n in images)),
+            frame_times_us=times_us,
             ego=ego,
             tracks=tracks,
             source=source,
@@ -107,10 +129,11 @@ class Argoverse2Reader:
                 "licence": "CC BY-NC-SA 4.0 (Wilson et al. 2021)",
                 "reader": self.name,
                 "track_ids": keys,
-                "cameras_without_images": without,
-                "frames_without_all_images": len(times_us) - len(frames),
             },
-            image_times_us=image_times,
+            image_times_us=matched.times_us,
+            absent_images=matched.absent,
+            absent_sweeps=frozenset() if has_lidar else frozenset(range(len(frames))),
+            left_out=left_out.told(),
             logged_map=_find_map(folder, T_world_city),
         )
 
@@ -127,59 +150,45 @@ def _logs(path: Path) -> dict[str, Path]:
     return {p.parent.name: p.parent for p in path.glob(f"*/{name}")}
 
 
-def _stamps(folder: Path, suffix: str) -> dict[int, Path]:
-    """Files by the time stamp [ns] that is their name."""
+def _recordings(folder: Path, suffix: str, left_out: LeftOut) -> TimedImages | None:
+    """Files by the time stamp [ns] that is their name; None without any."""
     files = {}
     for path in folder.glob(f"*{suffix}") if folder.is_dir() else ():
-        if not path.stem.isdecimal():
-            raise LogError(f"{path}: its name should be a time stamp [ns]")
-        files[int(path.stem)] = path
-    return dict(sorted(files.items()))
-
-
-def _list_sweeps(folder: Path) -> tuple[list[Path], NDArray[np.int64]]:
-    files = _stamps(folder, ".feather")
-    if not files:
-        raise LogError(f"{folder}: holds no sweeps <ns>.feather")
-    times_us = np.array([ns // 1000 for ns in files], dtype=np.int64)
-    return list(files.values()), check_frame_times(times_us, str(folder))
-
-
-def _list_images(folder: Path, cameras: Sequence[str]) -> tuple[dict[str, TimedImages], list[str]]:
-    found, without = {}, []
-    for name in cameras:
-        files = {} if name.startswith(LEFT_OUT) else _stamps(folder / name, ".jpg")
-        if files:
-            times = np.array([ns // 1000 for ns in files], dtype=np.int64)
-            found[name] = TimedImages(list(files.values()), times)
+        if path.stem.isdecimal() and len(path.stem) <= MAX_DIGITS:
+            files[int(path.stem) // 1000] = path
         else:
-            without.append(name)
-    return found, without
+            left_out.add("files", f"{path}: its name should be a time stamp [ns]")
+    times_us = sorted(files)
+    if not times_us:
+        return None
+    return TimedImages([files[t] for t in times_us], np.array(times_us, dtype=np.int64))
 
 
-def _read_ego(path: Path) -> Trajectory:
+def _read_ego(path: Path, left_out: LeftOut) -> Trajectory:
     """``T_city_vehicle``; the vehicle frame is on the ground."""
-    table = read_feather(path, ["timestamp_ns", *QUATERNION, *POSITION])
-    order = np.argsort(table["timestamp_ns"], kind="stable")
-    times_us, kept = np.unique(table["timestamp_ns"][order] // 1000, return_index=True)
-    try:
-        return Trajectory.from_transforms(
-            times_us, _transforms(table, path)[order][kept] @ _shift(-AXLE_HEIGHT)
-        )
-    except SceneError as error:
-        raise LogError(f"{path}: {error}") from error
+    table = read_feather(path, ["timestamp_ns", *QUATERNION, *POSITION], left_out, kind="poses")
+    poses, good = _transforms(table, path, "poses", left_out)
+    times_us = (table["timestamp_ns"] // 1000)[good]
+    times_us, kept = np.unique(times_us, return_index=True)
+    if len(times_us) == 0:
+        raise LogError(f"{path}: holds no usable pose")
+    return Trajectory.from_transforms(times_us, poses[good][kept] @ _shift(-AXLE_HEIGHT))
 
 
-def _transforms(table: Mapping[str, NDArray[Any]], path: Path) -> Float:
+def _transforms(
+    table: Mapping[str, NDArray[Any]], path: Path, kind: str, left_out: LeftOut
+) -> tuple[Float, NDArray[np.intp]]:
+    """Poses [N, 4, 4], and the rows of the usable ones; the others are left out."""
     positions = np.stack([table[n] for n in POSITION], axis=1).astype(np.float64)
-    quaternions = np.stack([table[n] for n in QUATERNION], axis=1)
+    quaternions = np.stack([table[n] for n in QUATERNION], axis=1).astype(np.float64)
     norms = np.linalg.norm(quaternions, axis=1)
-    bad = np.flatnonzero(~np.isfinite(positions).all(axis=1) | ~(np.abs(norms - 1) < 1e-2))
-    if len(bad):
-        raise LogError(
-            f"{path} row {bad[0]}: the pose is not finite, or its quaternion not of unit length"
+    bad = ~np.isfinite(positions).all(axis=1) | ~(np.abs(norms - 1) < 1e-2)
+    for row in np.flatnonzero(bad):
+        left_out.add(
+            kind, f"{path} row {row}: the pose is not finite, or its quaternion not of unit length"
         )
-    return transform_from(positions, quaternions)
+    quaternions[bad], positions[bad] = (1, 0, 0, 0), 0
+    return transform_from(positions, quaternions), np.flatnonzero(~bad)
 
 
 def _shift(z: float) -> Float:
@@ -188,51 +197,56 @@ def _shift(z: float) -> Float:
     return matrix
 
 
-def _read_calibration(folder: Path) -> tuple[dict[str, Lens], dict[str, Float]]:
+def _read_calibration(folder: Path, left_out: LeftOut) -> tuple[dict[str, Lens], dict[str, Float]]:
     """Lenses, and ``T_vehicle_sensor`` of all sensors."""
-    path = folder / "egovehicle_SE3_sensor.feather"
-    table = read_feather(path, ["sensor_name", *QUATERNION, *POSITION])
-    poses = _shift(AXLE_HEIGHT) @ _transforms(table, path)
-    mounts = {str(n): pose for n, pose in zip(table["sensor_name"], poses, strict=True)}
+    poses_path = folder / "egovehicle_SE3_sensor.feather"
+    table = read_feather(poses_path, ["sensor_name", *QUATERNION, *POSITION], left_out)
+    poses, good = _transforms(table, poses_path, "calibrations", left_out)
+    mounts = {str(table["sensor_name"][i]): _shift(AXLE_HEIGHT) @ poses[i] for i in good}
     path = folder / "intrinsics.feather"
     names = ["fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "k3", "width_px", "height_px"]
-    table = read_feather(path, ["sensor_name", *names])
+    table = read_feather(path, ["sensor_name", *names], left_out, kind="cameras")
     lenses = {}
-    for i, name in enumerate(table["sensor_name"]):
-        fx, fy, cx, cy, k1, k2, k3, width, height = (float(table[n][i]) for n in names)
-        k = np.array([[fx, 0, cx + 0.5], [0, fy, cy + 0.5], [0, 0, 1]])
-        lenses[str(name)] = Lens(int(width), int(height), k, (k1, k2, 0.0, 0.0, k3))
-    for name in (*lenses, "up_lidar"):
-        if name not in mounts:
-            raise LogError(f"{folder / 'egovehicle_SE3_sensor.feather'}: has no sensor {name!r}")
+    for i, key in enumerate(table["sensor_name"]):
+        name = str(key)
+        with left_out.damaged("cameras"):
+            values = [float(table[n][i]) for n in names]
+            fx, fy, cx, cy, k1, k2, k3, width, height = values
+            if not np.isfinite(values).all() or min(fx, fy, width, height) <= 0:
+                raise LogError(f"{path}: camera {name!r} has the intrinsics {values}")
+            if name not in mounts:
+                raise LogError(f"{poses_path}: has no pose of camera {name!r}")
+            k = np.array([[fx, 0, cx + 0.5], [0, fy, cy + 0.5], [0, 0, 1]])
+            lens = Lens(int(width), int(height), k, (k1, k2, 0.0, 0.0, k3))
+            lens.camera(name, mounts[name])
+            lenses[name] = lens
+    if "up_lidar" not in mounts:
+        left_out.add("LiDARs", f"{poses_path}: has no pose of 'up_lidar'")
     return lenses, mounts
 
 
-def _rig(
-    cameras: Mapping[str, object], lenses: Mapping[str, Lens], mounts: Mapping[str, Float]
-) -> CameraRig:
-    try:
-        return CameraRig(tuple(lenses[n].camera(n, mounts[n]) for n in cameras))
-    except SceneError as error:
-        raise LogError(f"calibration: {error}") from error
-
-
-def _read_tracks(path: Path, ego: Trajectory) -> tuple[tuple[ObjectTrack, ...], dict[str, str]]:
+def _read_tracks(
+    path: Path, ego: Trajectory, sweeps_us: NDArray[np.int64], left_out: LeftOut
+) -> tuple[tuple[ObjectTrack, ...], dict[str, str]]:
     """Tracks over all annotated instants, also those without a sweep."""
     if not path.exists():
         return (), {}
-    table = read_feather(
-        path, ["timestamp_ns", "track_uuid", "category", *SIZE, *QUATERNION, *POSITION]
-    )
+    names = ["timestamp_ns", "track_uuid", "category", *SIZE, *QUATERNION, *POSITION]
+    table = read_feather(path, names, left_out, kind="boxes")
     times_us = (table["timestamp_ns"] // 1000).tolist()
-    in_vehicle = _shift(AXLE_HEIGHT) @ _transforms(table, path)
+    poses, good = _transforms(table, path, "boxes", left_out)
+    in_vehicle = _shift(AXLE_HEIGHT) @ poses
+    inside = [t for t in set(times_us) if sweeps_us[0] < t < sweeps_us[-1]]
+    for t_us in sorted(set(inside) - set(sweeps_us.tolist())):
+        left_out.add("frames", f"{path}: has boxes at {t_us} us, when there is no sweep")
     vehicle = {t: ego.transform(t) for t in set(times_us) if ego.covers(t)}
     sizes = np.stack([table[n] for n in SIZE], axis=1).tolist()
     boxes = []
-    for row, time_us in enumerate(times_us):
-        where = f"{path} row {row}"
+    for row in good.tolist():
+        time_us, where = times_us[row], f"{path} row {row}"
         if time_us not in vehicle:
-            raise LogError(f"{where}: there is no ego pose at {time_us} us")
+            left_out.add("boxes", f"{where}: there is no ego pose at {time_us} us")
+            continue
         category = str(table["category"][row]).lower()
         length, width, height = sizes[row]
         boxes.append(
@@ -245,7 +259,7 @@ def _read_tracks(path: Path, ego: Trajectory) -> tuple[tuple[ObjectTrack, ...], 
                 where=where,
             )
         )
-    return build_tracks(boxes)
+    return build_tracks(boxes, left_out)
 
 
 @dataclass(frozen=True, eq=False)

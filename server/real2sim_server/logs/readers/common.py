@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import pairwise
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry import Float, invert_transform
+from ...geometry import Float, are_rigid, invert_transform
 from ...scene import BrownConrady, Camera, SceneError, Shutter, Trajectory
 from ...scene.camera import GLOBAL, Optics
 from ..driving_log import DrivingLog, LogError, ObjectTrack
@@ -49,31 +49,70 @@ def upright_pose(centre: Iterable[float], heading: float) -> Float:
     return pose
 
 
-def build_tracks(boxes: Iterable[FrameBox]) -> tuple[tuple[ObjectTrack, ...], dict[str, str]]:
+class LeftOut:
+    """Collects the records of a log that its reader does not use, by kind."""
+
+    def __init__(self) -> None:
+        self._told: dict[str, list[str]] = defaultdict(list)
+
+    def add(self, kind: str, sentence: str) -> None:
+        """Leave out one record; the sentence names the file, the place and the reason."""
+        self._told[kind].append(sentence)
+
+    @contextmanager
+    def damaged(self, kind: str) -> Iterator[None]:
+        """Leave out the record that the block reads if it raises LogError or SceneError."""
+        try:
+            yield
+        except (LogError, SceneError) as error:
+            self.add(kind, str(error))
+
+    def told(self) -> dict[str, tuple[str, ...]]:
+        """The sentences by kind, as ``DrivingLog.left_out``."""
+        return {kind: tuple(sentences) for kind, sentences in self._told.items()}
+
+
+def build_tracks(
+    boxes: Iterable[FrameBox], left_out: LeftOut, *, own_numbers: bool = False
+) -> tuple[tuple[ObjectTrack, ...], dict[str, str]]:
     """Tracks in order of first appearance, and the dataset's name of each by object id.
 
-    An object has its median size and its most frequent category; it is named
-    ``<category>_<number>``.
+    An object has its median size and its most frequent category. Boxes without a positive size or
+    a finite, rigid pose are left out, and all but the first of several boxes of one object at the
+    same time.
 
-    Raises:
-        LogError: a size that is not positive, a pose that is not finite or not a rigid transform,
-            or two boxes of one object at the same time.
+    Args:
+        boxes: of all objects and frames.
+        left_out: collects the boxes left out, and categories that change within a track.
+        own_numbers: the number in ``<category>_<number>`` is the dataset's name of the track.
     """
-    by_key: dict[str, list[FrameBox]] = defaultdict(list)
+    by_key: dict[str, dict[int, FrameBox]] = defaultdict(dict)
     for box in sorted(boxes, key=lambda b: (b.time_us, b.key)):
-        _check(box)
-        by_key[box.key].append(box)
+        with left_out.damaged("boxes"):
+            _check(box)
+            if box.time_us in by_key[box.key]:
+                raise LogError(f"{box.where}: {box.key!r} has two boxes at {box.time_us} us")
+            by_key[box.key][box.time_us] = box
     numbers: Counter[str] = Counter()
     tracks, keys = [], {}
-    for key, members in by_key.items():
-        category = Counter(b.category for b in members).most_common(1)[0][0]
-        object_id = f"{category}_{numbers[category]}"
+    for key, by_time in by_key.items():
+        members = list(by_time.values())
+        if not members:
+            continue
+        categories = Counter(b.category for b in members)
+        category = categories.most_common(1)[0][0]
+        for other, count in categories.items():
+            if other != category:
+                told = f"{key!r}: is a {category} in most frames, and a {other} in {count}"
+                left_out.add("categories", told)
+        object_id = f"{category}_{key if own_numbers else numbers[category]}"
         numbers[category] += 1
         keys[object_id] = key
         length, width, height = np.median([b.size for b in members], axis=0).tolist()
-        tracks.append(
-            ObjectTrack(object_id, category, (length, width, height), _trajectory(key, members))
+        trajectory = Trajectory.from_transforms(
+            np.array(list(by_time), dtype=np.int64), np.array([b.T_world_object for b in members])
         )
+        tracks.append(ObjectTrack(object_id, category, (length, width, height), trajectory))
     return tuple(tracks), keys
 
 
@@ -83,21 +122,28 @@ def _check(box: FrameBox) -> None:
             f"{box.where}: the box of {box.key!r} needs a positive length, width and height, not "
             f"{list(box.size)}"
         )
-    if not np.isfinite(box.T_world_object).all():
-        raise LogError(f"{box.where}: the pose of {box.key!r} is not finite")
+    pose = box.T_world_object
+    if not are_rigid(pose):
+        raise LogError(f"{box.where}: the pose of {box.key!r} is not finite, or not rigid")
 
 
-def _trajectory(key: str, members: list[FrameBox]) -> Trajectory:
-    times_us = [b.time_us for b in members]
-    for one, two in pairwise(members):
-        if one.time_us == two.time_us:
-            raise LogError(f"{two.where}: {key!r} has two boxes at {one.time_us} us")
-    try:
-        return Trajectory.from_transforms(
-            np.array(times_us, dtype=np.int64), np.array([b.T_world_object for b in members])
+def covered_frames(
+    ego: Trajectory, times_us: NDArray[np.int64], left_out: LeftOut, where: str
+) -> NDArray[np.intp]:
+    """Indices of the frames that the ego poses cover; the others are left out.
+
+    Raises:
+        LogError: they cover no frame.
+    """
+    covered = (times_us >= ego.start_us) & (times_us <= ego.end_us)
+    span = f"ego poses cover [{ego.start_us}, {ego.end_us}] us"
+    if not covered.any():
+        raise LogError(
+            f"{where}: {span}, but the frames go from {times_us.min()} to {times_us.max()} us"
         )
-    except SceneError as error:
-        raise LogError(f"{members[0].where}: {key!r}: {error}") from error
+    for t_us in times_us[~covered]:
+        left_out.add("frames", f"{where}: {span}, but not the frame at {t_us} us")
+    return np.flatnonzero(covered)
 
 
 # --- Image matching ------------------------------------------------------------------------------
@@ -118,14 +164,14 @@ class MatchedImages:
     """Images by frame.
 
     Attributes:
-        frames: [F] frames with an image of every camera: a run without gaps.
-        files: F files by camera.
-        times_us: [F] time stamps by camera.
+        files: F files by camera; of an absent image, any.
+        times_us: [F] time stamps by camera; of an absent image, the frame's.
+        absent: (camera, frame) without an image.
     """
 
-    frames: NDArray[np.intp]
     files: dict[str, list[Path]]
     times_us: dict[str, NDArray[np.int64]]
+    absent: frozenset[tuple[str, int]]
 
 
 def match_images(
@@ -133,49 +179,34 @@ def match_images(
     cameras: Mapping[str, TimedImages],
     *,
     tolerance_us: int,
+    left_out: LeftOut,
     where: Path,
 ) -> MatchedImages:
-    """The nearest image of every camera for every frame.
-
-    Frames at both ends without an image of some camera are dropped, because sensors start and stop
-    at different times.
+    """The nearest image of every camera for every frame; an image belongs to one frame.
 
     Args:
         frame_times_us: [F] increasing.
         cameras: at least one image each.
         tolerance_us: maximum time between an image and its frame.
+        left_out: collects the images that are absent.
         where: the log, for errors.
-
-    Raises:
-        LogError: a camera lacks an image in the middle of the log, or no frame has all images.
     """
-    nearest = {name: _nearest(frame_times_us, c.times_us) for name, c in cameras.items()}
-    found = {
-        name: np.abs(cameras[name].times_us[index] - frame_times_us) <= tolerance_us
-        for name, index in nearest.items()
-    }
-    whole = np.ones(len(frame_times_us), dtype=bool)
-    for mask in found.values():
-        whole &= mask
-    if not whole.any():
-        raise LogError(
-            f"{where}: no frame has an image of all cameras {sorted(cameras)} within "
-            f"{tolerance_us} us"
-        )
-    first, last = np.flatnonzero(whole)[[0, -1]]
-    for name, mask in found.items():
-        missing = np.flatnonzero(~mask[first : last + 1]) + first
-        if len(missing):
-            raise LogError(
-                f"{where}: camera {name!r} has no image within {tolerance_us} us of the frame at "
-                f"{frame_times_us[missing[0]]} us ({len(missing)} frames lack one)"
+    files, times_us, absent = {}, {}, set()
+    for name, camera in cameras.items():
+        index = _nearest(frame_times_us, camera.times_us)
+        owner = _nearest(camera.times_us[index], frame_times_us)
+        near = np.abs(camera.times_us[index] - frame_times_us) <= tolerance_us
+        found = near & (owner == np.arange(len(frame_times_us)))
+        files[name] = [camera.files[i] for i in index]
+        times_us[name] = np.where(found, camera.times_us[index], frame_times_us)
+        for i in np.flatnonzero(~found).tolist():
+            absent.add((name, i))
+            left_out.add(
+                "images" if name.islower() else "sweeps",
+                f"{where}: {name!r} recorded nothing within {tolerance_us * 1e-6:g} s of the frame "
+                f"at {frame_times_us[i]} us",
             )
-    frames = np.arange(first, last + 1)
-    return MatchedImages(
-        frames,
-        {n: [c.files[i] for i in nearest[n][frames]] for n, c in cameras.items()},
-        {n: c.times_us[nearest[n][frames]] for n, c in cameras.items()},
-    )
+    return MatchedImages(files, times_us, frozenset(absent))
 
 
 def _nearest(wanted: NDArray[np.int64], given: NDArray[np.int64]) -> NDArray[np.intp]:
@@ -400,6 +431,7 @@ class LogReader(Protocol):
 
         Raises:
             LogError: names the file (and line), the problem and the expected content. Tables are
-                checked here; images and sweeps when they are read, or by ``check_log``.
+                checked here; images and sweeps when they are read, or by ``check_log``. A record
+                that cannot be used is left out, and ``DrivingLog.left_out`` says so.
         """
         ...

@@ -8,6 +8,7 @@ original files instead.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...geometry import Float, invert_transform
-from ...scene import CameraRig, SceneError, Trajectory
+from ...scene import CameraRig, Trajectory
 from ..driving_log import DrivingLog, LidarSweep, LogError, ObjectTrack
-from ..images import image_size
-from .common import FrameBox, build_tracks
+from ..images import common_size
+from .common import FrameBox, LeftOut, build_tracks
 from .files import (
     ImageFiles,
     check_rigid,
@@ -61,18 +62,22 @@ class DrivestudioReader:
         """
         if sequence is not None:
             raise LogError(f"{path}: holds one drive; it has no sequence {sequence!r}")
-        poses = _read_poses(path / "ego_pose")
-        times_us = np.arange(len(poses), dtype=np.int64) * PERIOD_US
-        to_first = invert_transform(poses[0])
-        rig, images, without = _read_cameras(path, len(poses))
-        tracks, keys = _read_tracks(path / "instances" / "instances_info.json", to_first, times_us)
+        left_out = LeftOut()
+        poses = _read_poses(path / "ego_pose", left_out)
+        frames = sorted(poses)
+        times_us = np.array(frames, dtype=np.int64) * PERIOD_US
+        to_first = invert_transform(poses[frames[0]])
+        in_log = {frame: to_first @ pose for frame, pose in poses.items()}
+        rig, images = _read_cameras(path, frames, left_out)
+        info = path / "instances" / "instances_info.json"
+        tracks, keys = _read_tracks(info, to_first, in_log, left_out)
         return DrivingLog(
             name=f"drivestudio_{path.resolve().name}",
             rig=rig,
             frame_times_us=times_us,
-            ego=Trajectory.from_transforms(times_us, to_first @ poses),
+            ego=Trajectory.from_transforms(times_us, np.array([in_log[f] for f in frames])),
             tracks=tracks,
-            source=_DrivestudioSource(images, _sweep_files(path / "lidar", len(poses))),
+            source=_DrivestudioSource(images, _sweep_files(path / "lidar", frames)),
             ego_size=EGO_SIZE,
             provenance={
                 "dataset": "drivestudio folder (Waymo)",
@@ -80,14 +85,21 @@ class DrivestudioReader:
                 "licence": LICENCE,
                 "reader": self.name,
                 "track_ids": keys,
-                "cameras_without_images": without,
             },
+            left_out=left_out.told(),
         )
 
 
-def _read_poses(folder: Path) -> Float:
-    count = max(int(p.stem) for p in folder.glob("*.txt") if p.stem.isdecimal()) + 1
-    return np.array([_matrix(folder / f"{frame:03d}.txt") for frame in range(count)])
+def _read_poses(folder: Path, left_out: LeftOut) -> dict[int, Float]:
+    """Poses by frame; frames without a usable one are left out."""
+    numbers = [int(p.stem) for p in folder.glob("*.txt") if p.stem.isdecimal()]
+    poses = {}
+    for frame in range(max(numbers, default=-1) + 1):
+        with left_out.damaged("frames"):
+            poses[frame] = _matrix(folder / f"{frame:03d}.txt")
+    if not poses:
+        raise LogError(f"{folder}: holds no usable pose %03d.txt")
+    return poses
 
 
 def _matrix(path: Path) -> Float:
@@ -101,51 +113,51 @@ def _numbers(path: Path) -> Float:
     return parse_numbers(" ".join(read_lines(path)).split(), str(path))
 
 
-def _read_cameras(path: Path, count: int) -> tuple[CameraRig, ImageFiles, list[str]]:
-    cameras, files, lenses, without = [], {}, {}, []
+def _read_cameras(path: Path, frames: list[int], left_out: LeftOut) -> tuple[CameraRig, ImageFiles]:
+    cameras, files, lenses = [], {}, {}
     for intrinsics in sorted((path / "intrinsics").glob("*.txt")):
-        index = int(intrinsics.stem)
-        found = sorted((path / "images").glob(f"*_{index}.*"))
-        camera = waymo_camera(
-            index + 1,
-            size=image_size(found[0]) if found else (1, 1),
-            intrinsic=_numbers(intrinsics).tolist(),
-            extrinsic=_matrix(path / "extrinsics" / intrinsics.name),
-            shutter=0,
-            where=str(intrinsics),
-        )
-        if not found:
-            without.append(camera.name)
-            continue
-        names = [f"{frame:03d}_{index}{found[0].suffix}" for frame in range(count)]
-        files[camera.name] = [path / "images" / name for name in names]
-        lenses[camera.name] = camera.lens
-        cameras.append(camera)
-    images = ImageFiles(files, lenses)
-    try:
-        rig = CameraRig(tuple(c.lens.camera(c.name, c.T_vehicle_camera) for c in cameras))
-    except SceneError as error:
-        raise LogError(f"{path}: {error}") from error
-    return rig, images, without
+        with left_out.damaged("cameras"):
+            if not intrinsics.stem.isdecimal():
+                raise LogError(f"{intrinsics}: its name should be a camera's number")
+            index = int(intrinsics.stem)
+            found = sorted((path / "images").glob(f"*_{index}.*"))
+            if not found:
+                raise LogError(f"{path / 'images'}: camera {index} has no images")
+            camera = waymo_camera(
+                index + 1,
+                size=common_size(found),
+                intrinsic=_numbers(intrinsics).tolist(),
+                extrinsic=_matrix(path / "extrinsics" / intrinsics.name),
+                shutter=0,
+                where=str(intrinsics),
+            )
+            cameras.append(camera.lens.camera(camera.name, camera.T_vehicle_camera))
+            names = [f"{frame:03d}_{index}{found[0].suffix}" for frame in frames]
+            files[camera.name] = [path / "images" / name for name in names]
+            lenses[camera.name] = camera.lens
+    return CameraRig(tuple(cameras)), ImageFiles(files, lenses)
 
 
 def _read_tracks(
-    path: Path, to_first: Float, times_us: NDArray[np.int64]
+    path: Path, to_first: Float, poses: Mapping[int, Float], left_out: LeftOut
 ) -> tuple[tuple[ObjectTrack, ...], dict[str, str]]:
     if not path.exists():
         return (), {}
     content = read_json(path)
     if not isinstance(content, dict):
         raise LogError(f"{path}: expected an object of instances")
-    boxes = [
-        replace(box, T_world_object=to_first @ box.T_world_object)
-        for key, value in content.items()
-        for box in _boxes(path, key, value, times_us)
-    ]
-    return build_tracks(boxes)
+    boxes: list[FrameBox] = []
+    for key, value in content.items():
+        with left_out.damaged("objects"):
+            for box in _boxes(path, key, value):
+                if box.time_us // PERIOD_US in poses:
+                    boxes.append(replace(box, T_world_object=to_first @ box.T_world_object))
+                else:
+                    left_out.add("boxes", f"{box.where}: there is no usable frame of this number")
+    return build_tracks(boxes, left_out)
 
 
-def _boxes(path: Path, key: str, value: Any, times_us: NDArray[np.int64]) -> list[FrameBox]:
+def _boxes(path: Path, key: str, value: Any) -> list[FrameBox]:
     where = f"{path}: instance {key!r}"
     try:
         kind = str(value["class_name"]).lower()
@@ -158,25 +170,29 @@ def _boxes(path: Path, key: str, value: Any, times_us: NDArray[np.int64]) -> lis
             f"{where}: needs class_name and frame_annotations with frame_idx, obj_to_world and "
             f"box_size, as many of each ({error})"
         ) from error
-    if frames and not 0 <= min(frames) <= max(frames) < len(times_us):
-        raise LogError(f"{where}: has frames {min(frames)} to {max(frames)}, outside the drive")
     boxes = []
     for frame, pose, size in zip(frames, poses, sizes.tolist(), strict=True):
-        check_rigid(pose, f"{where}, frame {frame}")
         category = CATEGORIES.get(kind, kind)
         if category == "car" and size[0] > TRUCK_LENGTH:
             category = "truck"
         length, width, height = size
         boxes.append(
-            FrameBox(key, category, (length, width, height), int(times_us[frame]), pose, where)
+            FrameBox(
+                key,
+                category,
+                (length, width, height),
+                frame * PERIOD_US,
+                pose,
+                f"{where}, frame {frame}",
+            )
         )
     return boxes
 
 
-def _sweep_files(folder: Path, count: int) -> list[Path] | None:
+def _sweep_files(folder: Path, frames: list[int]) -> list[Path] | None:
     if not folder.is_dir():
         return None
-    return [folder / f"{frame:03d}.bin" for frame in range(count)]
+    return [folder / f"{frame:03d}.bin" for frame in frames]
 
 
 @dataclass(frozen=True, eq=False)

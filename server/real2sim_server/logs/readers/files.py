@@ -14,11 +14,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..._files import read_text
 from ...geometry import Float, is_rotation
 from ...scene import Trajectory
 from ..driving_log import LogError
 from ..images import check_image_file, read_image
-from .common import Lens
+from .common import LeftOut, Lens
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +49,7 @@ def read_json(path: Path) -> Any:
         LogError: the file is missing or not JSON.
     """
     try:
-        return json.loads(path.read_bytes())
+        return json.loads(read_text(path))
     except OSError as error:
         raise LogError(f"{path}: cannot be read ({error.strerror})") from error
     except (ValueError, RecursionError) as error:
@@ -58,20 +59,29 @@ def read_json(path: Path) -> Any:
 class Tables:
     """A folder of JSON tables with rows that refer to each other by ``token``."""
 
-    def __init__(self, folder: Path, names: Sequence[str]) -> None:
-        """Read the tables ``names``. Raises LogError naming a file that is missing or wrong."""
+    def __init__(self, folder: Path, names: Sequence[str], left_out: LeftOut) -> None:
+        """Read the tables ``names``; rows without a token of their own are left out.
+
+        Raises:
+            LogError: a file is missing, or is not a list.
+        """
         self._folder = folder
         self._rows: dict[str, list[_Row]] = {}
         self._by_token: dict[str, dict[str, _Row]] = {}
         for name in names:
             content = read_json(self.path(name))
-            if not isinstance(content, list) or not all(isinstance(r, dict) for r in content):
+            if not isinstance(content, list):
                 raise LogError(f"{self.path(name)}: expected a list of objects")
-            rows = [_Row(r, self.path(name)) for r in content]
-            if not all(isinstance(r["token"], str) for r in rows):
-                raise LogError(f"{self.path(name)}: a token is not text")
-            self._rows[name] = rows
-            self._by_token[name] = {r["token"]: r for r in rows}
+            by_token: dict[str, _Row] = {}
+            for number, item in enumerate(content):
+                token = item.get("token") if isinstance(item, dict) else None
+                if isinstance(token, str) and token not in by_token:
+                    by_token[token] = _Row(item, self.path(name))
+                    continue
+                reason = "has no token" if token not in by_token else f"is a second {token!r}"
+                left_out.add("rows", f"{self.path(name)}: row {number} {reason}")
+            self._rows[name] = list(by_token.values())
+            self._by_token[name] = by_token
 
     def path(self, name: str) -> Path:
         """The file of a table."""
@@ -141,18 +151,44 @@ class ParquetFile:
                     f"{self.path}: has no column {name!r}; it has {sorted(self.names)[:12]}"
                 )
 
+    def complete(self, names: Sequence[str], left_out: LeftOut) -> NDArray[np.bool_]:
+        """Which rows [N] have no empty cell in the columns ``names``; the others are left out."""
+        from pyarrow import compute
+
+        good = np.ones(len(self), dtype=bool)
+        for name in names:
+            column = self._whole(name)
+            if column.null_count:
+                good &= np.asarray(compute.is_valid(column))
+        for row in np.flatnonzero(~good):
+            left_out.add("rows", f"{self.path} row {row}: has an empty cell")
+        return good
+
     def numbers(self, name: str) -> NDArray[Any]:
-        """A whole column of numbers [N], or of fixed lists of numbers [N, K]."""
+        """A whole column of numbers [N], or of lists of K numbers [N, K].
+
+        Empty cells are 0 in columns of whole numbers, and NaN in others, as are lists of another
+        length than most; see :meth:`complete`.
+        """
+        import pyarrow as pa
+
         column = self._whole(name)
-        if column.null_count:
-            raise LogError(f"{self.path}: column {name!r} has {column.null_count} empty cells")
         if not _is_list(column.type):
             with _broken_named(f"{self.path}: column {name!r}"):
+                if column.null_count and pa.types.is_integer(column.type):
+                    column = column.fill_null(0)
                 return np.asarray(column.to_numpy(zero_copy_only=False))
-        flat = column.flatten()
-        if len(column) == 0 or len(flat) % len(column) or flat.null_count:
-            raise LogError(f"{self.path}: the lists of column {name!r} differ in length")
-        return np.asarray(flat.to_numpy(zero_copy_only=False)).reshape(len(column), -1)
+        lengths = np.asarray(column.value_lengths().fill_null(-1))
+        if len(lengths) == 0 or lengths.max() < 0:
+            raise LogError(f"{self.path}: column {name!r} is empty")
+        known = lengths[lengths >= 0]
+        length = int(np.bincount(known).argmax())
+        rows = np.full((len(column), length), np.nan)
+        with _broken_named(f"{self.path}: column {name!r}"):
+            fits = np.flatnonzero(lengths == length)
+            flat = column.take(pa.array(fits)).flatten()
+            rows[fits] = np.asarray(flat.to_numpy(zero_copy_only=False)).reshape(-1, length)
+        return rows
 
     def texts(self, name: str) -> list[str]:
         """A whole column of text [N]."""
@@ -223,14 +259,19 @@ def _require(path: Path, columns: Sequence[str], there: Sequence[str]) -> None:
             raise LogError(f"{path}: has no column {name!r}; it has {list(there)[:12]}")
 
 
-def read_feather(path: Path, columns: Sequence[str]) -> dict[str, NDArray[Any]]:
+def read_feather(
+    path: Path, columns: Sequence[str], left_out: LeftOut | None = None, *, kind: str = "rows"
+) -> dict[str, NDArray[Any]]:
     """Columns of a Feather file (version 2) as arrays, text as arrays of objects.
 
+    Rows with an empty cell are left out.
+
     Raises:
-        LogError: the file is missing or broken, a column is missing or has empty cells.
+        LogError: the file is missing or broken, a column is missing; without ``left_out`` also a
+            column with empty cells.
     """
     import pyarrow as pa
-    from pyarrow import ipc
+    from pyarrow import compute, ipc
 
     try:
         with path.open("rb") as file:
@@ -241,13 +282,20 @@ def read_feather(path: Path, columns: Sequence[str]) -> dict[str, NDArray[Any]]:
         raise LogError(f"{path}: cannot be read as a Feather file ({_line(error)})") from error
     with _broken_named(f"{path}: the list of columns"):
         _require(path, columns, list(table.column_names))
-    found = {}
+    empty = np.zeros(len(table), dtype=bool)
     for name in columns:
         column = table.column(name)
-        if column.null_count:
+        if column.null_count and left_out is None:
             raise LogError(f"{path}: column {name!r} has {column.null_count} empty cells")
+        if column.null_count:
+            empty |= np.asarray(compute.is_null(column))
+    if left_out is not None:
+        for row in np.flatnonzero(empty):
+            left_out.add(kind, f"{path} row {row}: has an empty cell")
+    found = {}
+    for name in columns:
         with _broken_named(f"{path}: column {name!r}"):
-            found[name] = np.asarray(column.to_numpy())
+            found[name] = np.asarray(table.column(name).filter(pa.array(~empty)).to_numpy())
     return found
 
 
@@ -311,13 +359,13 @@ def read_rows(path: Path, columns: int, hint: str = "is the file cut off?") -> N
 
 
 def read_lines(path: Path) -> list[str]:
-    """Lines of a text file without trailing blank ones.
+    """Lines of a text file, see ``_files.read_text``, without trailing blank ones.
 
     Raises:
         LogError: the file is missing, not text, or empty.
     """
     try:
-        text = path.read_text(encoding="utf-8").rstrip()
+        text = read_text(path).rstrip()
     except OSError as error:
         raise LogError(f"{path}: cannot be read ({error.strerror})") from error
     except UnicodeDecodeError as error:
@@ -338,20 +386,24 @@ def parse_numbers(words: list[str], where: str) -> Float:
     return values
 
 
-def read_number_table(path: Path, *, columns: int, what: str) -> Float:
-    """Rows [N, columns] float64 of a whitespace-separated table.
+def read_number_table(path: Path, *, columns: int, what: str, left_out: LeftOut) -> Float:
+    """Rows [N, columns] float64 of a table, separated by white space or commas.
+
+    A line with another number of columns, or with a value that is not finite, is a row of NaN.
 
     Raises:
-        LogError: with the line, for a wrong number of columns or values that are not finite.
+        LogError: the file cannot be read.
     """
-    rows = []
-    for number, line in enumerate(read_lines(path), start=1):
-        words = line.split()
-        where = f"{path} line {number}"
-        if len(words) != columns:
-            raise LogError(f"{where}: expected {columns} numbers ({what}), found {len(words)}")
-        rows.append(parse_numbers(words, where))
-    return np.array(rows)
+    lines = read_lines(path)
+    rows = np.full((len(lines), columns), np.nan)
+    for i, line in enumerate(lines):
+        with left_out.damaged("lines"):
+            words = line.replace(",", " ").split()
+            where = f"{path} line {i + 1}"
+            if len(words) != columns:
+                raise LogError(f"{where}: expected {columns} numbers ({what}), found {len(words)}")
+            rows[i] = parse_numbers(words, where)
+    return rows
 
 
 def check_rigid(matrix: Float, where: str) -> Float:

@@ -7,7 +7,7 @@ kit of the tracking benchmark.
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,13 +15,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry import Float, apply_transform, invert_transform
+from ...geometry import Float, apply_transform, are_rigid, invert_transform
 from ...scene import Camera, CameraRig, Trajectory
-from ..driving_log import DrivingLog, LidarSweep, LogError, ObjectTrack
-from ..images import check_image_file, image_size, read_image
-from .common import compensate_sweep, select_sequence
+from ..driving_log import NO_SWEEP, DrivingLog, LidarSweep, LogError, ObjectTrack
+from ..images import IMAGE_SUFFIXES, check_image_file, common_size, read_image
+from .common import FrameBox, LeftOut, build_tracks, compensate_sweep, select_sequence
 from .files import (
-    check_frame_times,
     check_rigid,
     count_rows,
     parse_numbers,
@@ -38,6 +37,7 @@ VELODYNE_HEIGHT = 1.73
 """Height of the Velodyne above the road [m], from the KITTI sensor set-up drawing."""
 
 FRAME_PERIOD_US = 100_000
+MAX_FRAMES = 1_000_000
 EARTH_RADIUS = 6378137.0
 
 _KEYS = {
@@ -69,7 +69,7 @@ class KittiLabel:
     """One box of one frame, in rectified cam0 coordinates.
 
     Attributes:
-        frame, track_id: as in the file.
+        frame, track_id, where: as in the file, and its line.
         category: the project's category, lower-case.
         size: (length, width, height) [m].
         T_cam0_object: [4, 4], origin at the box centre, x forward, z up.
@@ -80,9 +80,10 @@ class KittiLabel:
     category: str
     size: tuple[float, float, float]
     T_cam0_object: Float
+    where: str
 
 
-def read_calibration(path: Path) -> KittiCalibration:
+def read_calibration(path: Path, left_out: LeftOut) -> KittiCalibration:
     """Read ``calib/NNNN.txt`` in either spelling of its keys.
 
     The vehicle frame follows the published setup: the IMU is above the rear axle, the Velodyne on
@@ -92,7 +93,7 @@ def read_calibration(path: Path) -> KittiCalibration:
     Raises:
         LogError: a matrix is missing, has a wrong number of values, or is not a rigid transform.
     """
-    return calibration_from(read_entries(path), path)
+    return calibration_from(read_entries(path, left_out), path)
 
 
 def calibration_from(entries: Mapping[str, Float], path: Path) -> KittiCalibration:
@@ -114,17 +115,21 @@ def calibration_from(entries: Mapping[str, Float], path: Path) -> KittiCalibrati
     )
 
 
-def read_entries(path: Path, *, words: Sequence[str] = ()) -> dict[str, Float]:
+def read_entries(path: Path, left_out: LeftOut, *, words: Sequence[str] = ()) -> dict[str, Float]:
     """Lines ``key: numbers`` of a calibration file; skips keys with text, given in ``words``.
 
-    Raises:
-        LogError: values that are not finite numbers; names the line.
+    The first of several lines with one key counts.
     """
-    entries = {}
+    entries: dict[str, Float] = {}
     for number, line in enumerate(read_lines(path), start=1):
         key, _, values = line.replace(":", " ").strip().partition(" ")
-        if key and key not in words:
-            entries[key] = parse_numbers(values.split(), f"{path} line {number}")
+        if not key or key in words:
+            continue
+        with left_out.damaged("lines"):
+            where = f"{path} line {number}"
+            if key in entries:
+                raise LogError(f"{where}: has a second {key}")
+            entries[key] = parse_numbers(values.split(), where)
     return entries
 
 
@@ -148,36 +153,35 @@ def _place_velodyne(T_cam0_velo: Float, T_velo_imu: Float) -> Float:
     return T_vehicle_velo
 
 
-def read_poses(path: Path) -> Float:
+def read_poses(path: Path, left_out: LeftOut) -> Float:
     """``T_world_cam0`` [N, 4, 4] of a KITTI odometry pose file (12 numbers per line).
 
-    Raises:
-        LogError: with the line.
+    Damaged lines are matrices of NaN.
     """
-    rows = read_number_table(path, columns=12, what="a 3x4 pose, row by row")
+    rows = read_number_table(path, columns=12, what="a 3x4 pose, row by row", left_out=left_out)
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3] = rows.reshape(-1, 3, 4)
-    for number, pose in enumerate(poses, start=1):
-        check_rigid(pose, f"{path} line {number}")
+    for i in np.flatnonzero(~are_rigid(poses) & np.isfinite(rows).all(axis=1)):
+        left_out.add("lines", f"{path} line {i + 1}: its left 3x3 block is not a rotation matrix")
+        poses[i] = np.nan
     return poses
 
 
-def read_oxts(path: Path) -> Float:
-    """``T_world_imu`` [N, 4, 4] of an OXTS file (30 numbers per line), Mercator projection.
-
-    As in the KITTI development kit, the projection is scaled by the cosine of the first latitude,
-    and the rotation is Rz(yaw) Ry(pitch) Rx(roll).
-
-    Raises:
-        LogError: with the line.
-    """
-    return oxts_poses(read_number_table(path, columns=30, what="an OXTS record"))
+def read_oxts(path: Path, left_out: LeftOut) -> Float:
+    """``T_world_imu`` [N, 4, 4] of an OXTS file (30 numbers per line), see :func:`oxts_poses`."""
+    what = "an OXTS record"
+    return oxts_poses(read_number_table(path, columns=30, what=what, left_out=left_out))
 
 
 def oxts_poses(rows: Float) -> Float:
-    """``T_world_imu`` [N, 4, 4] of OXTS records [N, 30], see :func:`read_oxts`."""
+    """``T_world_imu`` [N, 4, 4] of OXTS records [N, 30], Mercator projection.
+
+    As in the KITTI development kit, the projection is scaled by the cosine of the first latitude,
+    and the rotation is Rz(yaw) Ry(pitch) Rx(roll). Records of NaN are matrices of NaN.
+    """
     latitude, longitude, altitude, roll, pitch, yaw = rows[:, :6].T
-    scale = np.cos(np.radians(latitude[0]))
+    known = latitude[np.isfinite(latitude)]
+    scale = np.cos(np.radians(known[0] if len(known) else 0.0))
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, 0, 3] = scale * EARTH_RADIUS * np.radians(longitude)
     poses[:, 1, 3] = scale * EARTH_RADIUS * np.log(np.tan(np.radians(90 + latitude) / 2))
@@ -194,37 +198,76 @@ def _about(axis: int, angle: Float) -> Float:
     return rotation
 
 
-def read_times(path: Path, frame_count: int) -> NDArray[np.int64]:
+def read_times(path: Path, frame_count: int, left_out: LeftOut) -> Float:
     """Frame times [F] [us], from ``path`` with one time per line [s], or at 10 Hz without the file.
 
+    Damaged lines are NaN.
+
     Raises:
-        LogError: wrong count or order.
+        LogError: the file has another number of lines.
     """
     if not path.exists():
-        return np.arange(frame_count, dtype=np.int64) * FRAME_PERIOD_US
-    seconds = read_number_table(path, columns=1, what="seconds")[:, 0]
-    if len(seconds) != frame_count:
-        raise LogError(f"{path}: holds {len(seconds)} times, but there are {frame_count} frames")
-    return check_frame_times(np.round(seconds * 1e6).astype(np.int64), str(path))
+        return np.arange(frame_count, dtype=np.float64) * FRAME_PERIOD_US
+    seconds = read_number_table(path, columns=1, what="seconds", left_out=left_out)[:, 0]
+    check_line_count(path, len(seconds), frame_count)
+    times_us: Float = np.round(seconds * 1e6)
+    return times_us
 
 
-def read_labels(path: Path, frame_count: int) -> list[KittiLabel]:
-    """All boxes of a tracking label file (17 columns), without ``DontCare`` regions.
+def check_line_count(path: Path, lines: int, frame_count: int) -> None:
+    """Check that a file has a line for each frame, because its lines do not name their frames.
 
     Raises:
-        LogError: with the line, for wrong columns, frames outside the log, or sizes of zero.
+        LogError: otherwise.
+    """
+    if lines != frame_count:
+        raise LogError(
+            f"{path}: has {lines} lines, but the numbers of images and scans go to "
+            f"{frame_count - 1}; its lines do not name their frames, so none can be missing"
+        )
+
+
+def usable_frames(
+    times_us: NDArray[np.float64], poses: Float, left_out: LeftOut, where: Path
+) -> NDArray[np.intp]:
+    """Frames with a pose, and a time after that of the frame before; the others are left out.
+
+    Raises:
+        LogError: there is none.
+    """
+    kept: list[int] = []
+    for frame, (t_us, pose) in enumerate(zip(times_us, poses, strict=True)):
+        if not (np.isfinite(t_us) and np.isfinite(pose).all()):
+            left_out.add("frames", f"{where}: frame {frame} has no usable pose or time")
+        elif kept and t_us <= times_us[kept[-1]]:
+            told = f"frame {frame} is at {t_us:.0f} us, not after frame {kept[-1]}"
+            left_out.add("frames", f"{where}: {told}")
+        else:
+            kept.append(frame)
+    if not kept:
+        raise LogError(f"{where}: has no usable pose")
+    return np.array(kept)
+
+
+def read_labels(path: Path, frame_count: int, left_out: LeftOut) -> list[KittiLabel]:
+    """All boxes of a tracking label file (17 columns), without ``DontCare`` regions.
+
+    More columns, such as the score of a tracker, are ignored.
     """
     labels = []
     for number, line in enumerate(read_lines(path), start=1):
-        words = line.split()
-        where = f"{path} line {number}"
-        if len(words) != 17:
-            raise LogError(
-                f"{where}: expected 17 columns (frame id type truncated occluded alpha, 2D box, "
-                f"h w l, x y z, ry), found {len(words)}"
-            )
-        if words[2] != "DontCare":
-            labels.append(_parse_label(words, where, frame_count))
+        words = line.replace(",", " ").split()
+        if not words:
+            continue
+        with left_out.damaged("boxes"):
+            where = f"{path} line {number}"
+            if len(words) < 17:
+                raise LogError(
+                    f"{where}: expected 17 columns (frame id type truncated occluded alpha, 2D "
+                    f"box, h w l, x y z, ry), found {len(words)}"
+                )
+            if words[2] != "DontCare":
+                labels.append(_parse_label(words[:17], where, frame_count))
     return labels
 
 
@@ -234,8 +277,6 @@ def _parse_label(words: list[str], where: str, frame_count: int) -> KittiLabel:
     height, width, length, x, y, z, heading = numbers[2:]
     if not 0 <= frame < frame_count:
         raise LogError(f"{where}: frame {frame} is outside the log's 0 to {frame_count - 1}")
-    if min(height, width, length) <= 0:
-        raise LogError(f"{where}: box sizes must be positive, not {height} {width} {length}")
     kind = words[2].lower()
     cos, sin = np.cos(heading), np.sin(heading)
     pose = np.eye(4)
@@ -243,14 +284,12 @@ def _parse_label(words: list[str], where: str, frame_count: int) -> KittiLabel:
     pose[:3, :3] = np.array([[cos, sin, 0], [0, 0, -1], [-sin, cos, 0]])
     pose[:3, 3] = x, y - height / 2, z
     category = _CATEGORIES.get(kind, kind)
-    return KittiLabel(frame, track_id, category, (length, width, height), pose)
+    return KittiLabel(frame, track_id, category, (length, width, height), pose, where)
 
 
 SWEEP_US = 100_000
 COLUMNS = 4
 """Columns of a scan's points: x, y, z, reflectance."""
-MISSING_SCANS = {"0001": range(177, 181)}
-"""Scans missing in the published data set, by sequence; these frames get an empty sweep."""
 
 KITTI_EGO_SIZE = (4.77, 1.82, 1.50)
 """VW Passat B6 Variant, the recording car [m]."""
@@ -283,31 +322,39 @@ class KittiReader:
             LogError: see :class:`LogReader`.
         """
         root = _training_folder(path)
-        sequence = _select_sequence(root, sequence)
-        calibration = read_calibration(root / "calib" / f"{sequence}.txt")
-        images = _image_files(root, sequence)
-        frame_count = len(images["image_02"])
-        rig = read_rig(root / "calib" / f"{sequence}.txt", calibration, images)
-        scans = _scan_files(root / "velodyne" / sequence, sequence, frame_count)
-        times_us = read_times(root / "times" / f"{sequence}.txt", frame_count)
-        vehicle_poses, pose_source = _vehicle_poses(root, sequence, frame_count, calibration)
-        labels, label_source = _labels(root, sequence, frame_count)
+        sequence, left_out = _select_sequence(root, sequence), LeftOut()
+        calibration_file = root / "calib" / f"{sequence}.txt"
+        calibration = read_calibration(calibration_file, left_out)
+        folders = {f"image_{i:02d}": root / f"image_{i:02d}" / sequence for i in range(4)}
+        scans = root / "velodyne" / sequence
+        files = numbered_files(folders, scans, digits=6)
+        rig = read_rig(calibration_file, calibration, files.images, left_out)
+        times_us = read_times(root / "times" / f"{sequence}.txt", files.count, left_out)
+        poses, T_vehicle_sensor, poses_file = _sensor_poses(
+            root, sequence, files.count, calibration, left_out
+        )
+        frames = usable_frames(times_us, poses, left_out, poses_file)
+        poses = vehicle_poses(poses, frames, T_vehicle_sensor)
+        labels, label_source = _labels(root, sequence, files.count, left_out)
+        tracks = _tracks(labels, poses @ calibration.T_vehicle_cam0, times_us, frames, left_out)
+        chosen = times_us[frames].astype(np.int64)
         return DrivingLog(
             name=f"kitti_{sequence}",
             rig=rig,
-            frame_times_us=times_us,
-            ego=Trajectory.from_transforms(times_us, vehicle_poses),
-            tracks=_tracks(labels, vehicle_poses @ calibration.T_vehicle_cam0, times_us),
-            source=KittiSource(rig, images, scans, calibration.T_vehicle_velo, vehicle_poses),
+            frame_times_us=chosen,
+            ego=Trajectory.from_transforms(chosen, poses[frames]),
+            tracks=tracks,
+            source=KittiSource(rig, files, frames, calibration.T_vehicle_velo, poses),
             ego_size=KITTI_EGO_SIZE,
             provenance={
                 "dataset": "KITTI tracking layout",
                 "sequence": sequence,
                 "licence": "CC BY-NC-SA 3.0 (Geiger et al. 2013)",
                 "reader": self.name,
-                "poses": pose_source,
+                "poses": poses_file.parent.name,
                 "boxes": label_source,
             },
+            left_out=left_out.told(),
         )
 
 
@@ -323,150 +370,194 @@ def _select_sequence(root: Path, sequence: str | None) -> str:
     return select_sequence(folder, known, sequence)
 
 
-def _image_files(root: Path, sequence: str) -> dict[str, list[Path]]:
-    """Files of every camera; all lists have the length of the longest."""
-    folders, suffixes, frame_count = {}, {}, 0
-    for folder in (root / f"image_{i:02d}" / sequence for i in range(4)):
-        if folder.is_dir():
-            name = folder.parent.name
-            folders[name] = folder
-            suffixes[name] = ".jpg" if (folder / "000000.jpg").exists() else ".png"
-            count = sum(p.suffix == suffixes[name] for p in folder.iterdir())
-            frame_count = max(frame_count, count)
-    if frame_count == 0:
-        raise LogError(f"{root / 'image_02' / sequence}: holds no images %06d.png")
-    return {
-        name: [folder / f"{f:06d}{suffixes[name]}" for f in range(frame_count)]
-        for name, folder in folders.items()
-    }
+@dataclass(frozen=True, eq=False)
+class KittiFiles:
+    """Files of the frames of a drive: images by camera, and scans (None without LiDAR)."""
+
+    images: dict[str, list[Path]]
+    scans: list[Path] | None
+
+    @property
+    def count(self) -> int:
+        """Number of frames."""
+        return len(next(iter(self.images.values())))
 
 
-def read_rig(path: Path, calibration: KittiCalibration, images: dict[str, list[Path]]) -> CameraRig:
+def numbered_files(folders: Mapping[str, Path], scans: Path, *, digits: int) -> KittiFiles:
+    """The files of all frames up to the highest number of an image or a scan.
+
+    Args:
+        folders: folders of images by camera; those that do not exist are skipped.
+        scans: folder of scans ``.bin``.
+        digits: digits of a number in file names.
+
+    Raises:
+        LogError: no image or scan is there.
+    """
+    suffixes, highest = {}, -1
+    for name, folder in folders.items():
+        images = [p for p in folder.glob("*") if p.suffix.lower() in IMAGE_SUFFIXES]
+        numbered = [p for p in images if p.stem.isdecimal()]
+        if numbered:
+            suffixes[name] = Counter(p.suffix for p in numbered).most_common(1)[0][0]
+            highest = max(highest, *(int(p.stem) for p in numbered))
+    for path in scans.glob("*.bin"):
+        if path.stem.isdecimal():
+            highest = max(highest, int(path.stem))
+    if not suffixes or not 0 <= highest < MAX_FRAMES:
+        expected = ", ".join(str(folder / f"%0{digits}d.png") for folder in folders.values())
+        raise LogError(f"there are no images; expected {expected}")
+    names = [f"{frame:0{digits}d}" for frame in range(highest + 1)]
+    return KittiFiles(
+        {n: [folders[n] / f"{name}{suffix}" for name in names] for n, suffix in suffixes.items()},
+        [scans / f"{name}.bin" for name in names] if scans.is_dir() else None,
+    )
+
+
+def read_rig(
+    path: Path,
+    calibration: KittiCalibration,
+    images: Mapping[str, Sequence[Path]],
+    left_out: LeftOut,
+) -> CameraRig:
     """Cameras by name ``image_NN``; ``path`` is the calibration, for errors."""
     cameras = []
     for name, files in images.items():
-        index = int(name[-2:])
-        if index not in calibration.projections:
-            raise LogError(f"{path}: has no line P{index}: with 12 values, needed for {name}")
-        projection = calibration.projections[index]
-        k = projection[:, :3].copy()
-        if k[0, 0] <= 0 or k[1, 1] <= 0:
-            raise LogError(f"{path}: P{index} needs positive focal lengths, not {projection}")
-        T_camera_cam0 = np.eye(4)
-        T_camera_cam0[:3, 3] = np.linalg.solve(k, projection[:, 3])
-        # KITTI puts pixel centres at integers, a Camera at +0.5.
-        k[:2, 2] += 0.5
-        pose = calibration.T_vehicle_cam0 @ invert_transform(T_camera_cam0)
-        width, height = image_size(files[0])
-        cameras.append(Camera(name, width, height, k, pose))
+        with left_out.damaged("cameras"):
+            index = int(name[-2:])
+            if index not in calibration.projections:
+                raise LogError(f"{path}: has no line P{index}: with 12 values, needed for {name}")
+            projection = calibration.projections[index]
+            k = projection[:, :3].copy()
+            if k[0, 0] <= 0 or k[1, 1] <= 0:
+                raise LogError(f"{path}: P{index} needs positive focal lengths, not {projection}")
+            T_camera_cam0 = np.eye(4)
+            T_camera_cam0[:3, 3] = np.linalg.solve(k, projection[:, 3])
+            # KITTI puts pixel centres at integers, a Camera at +0.5.
+            k[:2, 2] += 0.5
+            pose = calibration.T_vehicle_cam0 @ invert_transform(T_camera_cam0)
+            cameras.append(Camera(name, *common_size(files), k, pose))
     return CameraRig(tuple(cameras))
 
 
-def _scan_files(folder: Path, sequence: str, frame_count: int) -> list[Path | None]:
-    if not folder.is_dir():
-        raise LogError(f"{folder}: no such folder; expected {frame_count} scans %06d.bin")
-    scans: list[Path | None] = []
-    for frame in range(frame_count):
-        path = folder / f"{frame:06d}.bin"
-        if not path.exists() and frame in MISSING_SCANS.get(sequence, ()):
-            scans.append(None)
-            continue
-        scans.append(path)
-    return scans
-
-
-def _vehicle_poses(
-    root: Path, sequence: str, frame_count: int, calibration: KittiCalibration
-) -> tuple[Float, str]:
+def _sensor_poses(
+    root: Path, sequence: str, frame_count: int, calibration: KittiCalibration, left_out: LeftOut
+) -> tuple[Float, Float, Path]:
+    """Poses [F, 4, 4] of a sensor, NaN where a line is damaged; its ``T_vehicle_sensor``; file."""
     poses_file, oxts_file = (root / folder / f"{sequence}.txt" for folder in ("poses", "oxts"))
     if poses_file.exists():
-        path, poses, T_vehicle_sensor = (
-            poses_file,
-            read_poses(poses_file),
-            calibration.T_vehicle_cam0,
-        )
+        path, poses = poses_file, read_poses(poses_file, left_out)
+        T_vehicle_sensor = calibration.T_vehicle_cam0
     elif oxts_file.exists():
-        path, poses, T_vehicle_sensor = oxts_file, read_oxts(oxts_file), calibration.T_vehicle_imu
+        path, poses = oxts_file, read_oxts(oxts_file, left_out)
+        T_vehicle_sensor = calibration.T_vehicle_imu
     else:
         raise LogError(f"no ego poses: neither {poses_file} nor {oxts_file} exists")
-    if len(poses) != frame_count:
-        raise LogError(f"{path}: holds {len(poses)} poses, but there are {frame_count} images")
-    motion = invert_transform(poses[0]) @ poses
-    return T_vehicle_sensor @ motion @ invert_transform(T_vehicle_sensor), path.parent.name
+    check_line_count(path, len(poses), frame_count)
+    return poses, T_vehicle_sensor, path
 
 
-def _labels(root: Path, sequence: str, frame_count: int) -> tuple[list[KittiLabel], str | None]:
+def vehicle_poses(sensor_poses: Float, frames: NDArray[np.intp], T_vehicle_sensor: Float) -> Float:
+    """``T_world_vehicle`` [F, 4, 4] of all frames; the world is the first usable vehicle frame.
+
+    Frames between usable ones get interpolated poses, which serve motion compensation.
+    """
+    motion = invert_transform(sensor_poses[frames[0]]) @ sensor_poses
+    poses = T_vehicle_sensor @ motion @ invert_transform(T_vehicle_sensor)
+    if len(frames) < len(poses):
+        steps = Trajectory.from_transforms(frames, poses[frames])
+        for frame in np.setdiff1d(np.arange(frames[0], frames[-1]), frames).tolist():
+            poses[frame] = steps.transform(frame)
+    return poses
+
+
+def _labels(
+    root: Path, sequence: str, frame_count: int, left_out: LeftOut
+) -> tuple[list[KittiLabel], str | None]:
     for folder in ("boxes_surround", "label_02"):
         path = root / folder / f"{sequence}.txt"
         if path.exists():
-            return read_labels(path, frame_count), folder
+            return read_labels(path, frame_count, left_out), folder
     if (root / "label_02").is_dir():
-        raise LogError(f"{root / 'label_02' / sequence}.txt: no such file; it holds the boxes")
+        missing = root / "label_02" / f"{sequence}.txt"
+        left_out.add("files", f"{missing}: no such file; it holds the boxes")
     return [], None
 
 
 def _tracks(
-    labels: list[KittiLabel], T_world_cam0: Float, times_us: NDArray[np.int64]
+    labels: list[KittiLabel],
+    T_world_cam0: Float,
+    times_us: NDArray[np.float64],
+    frames: NDArray[np.intp],
+    left_out: LeftOut,
 ) -> tuple[ObjectTrack, ...]:
-    by_object: dict[tuple[int, str], dict[int, KittiLabel]] = defaultdict(dict)
+    kept, boxes = set(frames.tolist()), []
     for label in labels:
-        by_object[label.track_id, label.category][label.frame] = label
-    tracks = []
-    for (track_id, category), boxes in sorted(by_object.items()):
-        frames = sorted(boxes)
-        transforms = [T_world_cam0[f] @ boxes[f].T_cam0_object for f in frames]
-        length, width, height = np.median([boxes[f].size for f in frames], axis=0)
-        tracks.append(
-            ObjectTrack(
-                object_id=f"{category}_{track_id}",
-                category=category,
-                size=(float(length), float(width), float(height)),
-                trajectory=Trajectory.from_transforms(times_us[frames], np.array(transforms)),
+        if label.frame not in kept:
+            left_out.add("boxes", f"{label.where}: its frame is left out")
+            continue
+        boxes.append(
+            FrameBox(
+                key=str(label.track_id),
+                category=label.category,
+                size=label.size,
+                time_us=int(times_us[label.frame]),
+                T_world_object=T_world_cam0[label.frame] @ label.T_cam0_object,
+                where=label.where,
             )
         )
-    return tuple(tracks)
+    return build_tracks(boxes, left_out, own_numbers=True)[0]
 
 
 @dataclass(frozen=True, eq=False)
 class KittiSource:
-    """Files of a KITTI drive, and the data for motion compensation to image time."""
+    """Files of a KITTI drive, and the data for motion compensation to image time.
+
+    Attributes:
+        rig: cameras.
+        files: of all frames of the drive.
+        frames: numbers of the log's frames.
+        T_vehicle_velo: [4, 4].
+        vehicle_poses: ``T_world_vehicle`` of all frames, see :func:`vehicle_poses`.
+    """
 
     rig: CameraRig
-    images: dict[str, list[Path]]
-    scans: list[Path | None]
+    files: KittiFiles
+    frames: NDArray[np.intp]
     T_vehicle_velo: Float
     vehicle_poses: Float
 
     def image(self, camera: str, frame: int) -> NDArray[np.uint8]:
         """RGB [H, W, 3]; see :class:`FrameSource`."""
-        return read_image(self.images[camera][frame])
+        return read_image(self._image_file(camera, frame))
 
     def check_image(self, camera: str, frame: int) -> None:
         """See :class:`ChecksFiles`."""
         lens = self.rig[camera]
-        check_image_file(self.images[camera][frame], (lens.width, lens.height))
+        check_image_file(self._image_file(camera, frame), (lens.width, lens.height))
 
     def check_sweep(self, frame: int) -> int:
         """See :class:`ChecksFiles`."""
-        path = self.scans[frame]
-        return 0 if path is None else count_rows(path, COLUMNS)
+        scans = self.files.scans
+        return 0 if scans is None else count_rows(scans[self.frames[frame]], COLUMNS)
 
     def lidar(self, frame: int) -> LidarSweep:
         """The compensated scan; see :class:`FrameSource`."""
-        scan = self._raw_scan(frame)
+        if self.files.scans is None:
+            return NO_SWEEP
+        number, first, last = self.frames[frame], self.frames[0], self.frames[-1]
+        scan = read_rows(self.files.scans[number], COLUMNS)
+        scan = scan[np.isfinite(scan).all(axis=1)]
         points = scan[:, :3].astype(np.float64)
         offset = -np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi)
         in_vehicle = apply_transform(self.T_vehicle_velo, points)
+        poses = self.vehicle_poses[first : last + 1]
         return LidarSweep(
-            points=compensate_sweep(in_vehicle, offset, self.vehicle_poses, frame),
+            points=compensate_sweep(in_vehicle, offset, poses, int(number - first)),
             intensity=np.clip(scan[:, 3], 0, 1),
             offset_us=np.round(offset * SWEEP_US).astype(np.int32),
             origin=self.T_vehicle_velo[:3, 3].astype(np.float32),
         )
 
-    def _raw_scan(self, frame: int) -> NDArray[np.float32]:
-        path = self.scans[frame]
-        if path is None:
-            return np.zeros((0, COLUMNS), dtype=np.float32)
-        scan = read_rows(path, COLUMNS)
-        return scan[np.isfinite(scan).all(axis=1)]
+    def _image_file(self, camera: str, frame: int) -> Path:
+        return self.files.images[camera][int(self.frames[frame])]

@@ -18,13 +18,15 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
+from ..._files import read_text
 from ..._npy import read_entries, read_headers, read_npy
 from ...scene import Camera, CameraRig, LaneGraph, SceneError, Trajectory
 from ...scene.camera import Optics
 from ...scene.io.document import OpticsPart, lane_document, read_lanes
-from ..driving_log import DrivingLog, LidarSweep, LogError, ObjectTrack
+from ..driving_log import NO_SWEEP, DrivingLog, LidarSweep, LogError, ObjectTrack
 from ..images import IMAGE_SUFFIXES, check_image_file, read_image, write_image
-from .files import check_ego_covers, check_frame_times
+from .common import LeftOut, covered_frames
+from .files import check_frame_times
 
 FORMAT = "real2sim-log"
 VERSION = 1
@@ -42,6 +44,7 @@ EGO_KEYS = ("size", *POSE_KEYS)
 TRACK_KEYS = ("object_id", "category", "size", *POSE_KEYS)
 SWEEP_SHAPES = {"points": (-1, 3), "intensity": (-1,), "offset_us": (-1,), "origin": (3,)}
 """Shapes of the arrays; -1 is the number of points."""
+QUATERNION_TOLERANCE = 1e-2
 MAX_OFFSET_US = 10_000_000
 """Maximum difference between the time of a point and its frame's [us]."""
 
@@ -66,39 +69,45 @@ class NativeReader:
         if sequence is not None:
             raise LogError(f"{path}: holds one log; it has no sequence {sequence!r}")
         content = _JsonSection(_load(manifest), str(manifest)).only(LOG_KEYS)
-        times_us = check_frame_times(content.integers("frame_times_us"), str(manifest))
-        rig = _read_rig(content)
+        left_out = LeftOut()
+        given = check_frame_times(content.integers("frame_times_us"), str(manifest))
         ego = content.section("ego").only(EGO_KEYS)
-        trajectory = _read_trajectory(ego)
-        check_ego_covers(trajectory, times_us, str(manifest))
-        images = _image_files(path, rig, len(times_us))
+        path_driven = _read_trajectory(ego, left_out, "poses")
+        frames = covered_frames(path_driven, given, left_out, str(manifest))
+        rig = _read_rig(content, left_out)
+        times_us = given[frames]
+        images = _image_files(path, rig, frames)
+        sweeps = [path / "lidar" / f"{f:06d}.npz" for f in frames]
         return DrivingLog(
             name=str(content.get("name", str)),
             rig=rig,
             frame_times_us=times_us,
-            ego=trajectory,
-            tracks=_read_tracks(content),
-            source=_NativeSource(rig, images, _sweep_files(path, content, len(times_us))),
+            ego=path_driven,
+            tracks=_read_tracks(content, left_out),
+            source=_NativeSource(rig, images, sweeps if content.get("lidar", bool) else None),
             ego_size=ego.size("size"),
             provenance=content.get("provenance", dict) if "provenance" in content.content else {},
-            image_times_us=_read_image_times(content, rig, times_us, trajectory),
-            lanes=_read_lanes(path / LANES),
+            image_times_us={
+                name: taken[frames]
+                for name, taken in _read_image_times(content, rig, given, left_out).items()
+            },
+            lanes=_read_lanes(path / LANES, left_out),
+            left_out=left_out.told(),
         )
 
 
-def _read_lanes(path: Path) -> LaneGraph | None:
+def _read_lanes(path: Path, left_out: LeftOut) -> LaneGraph | None:
     """The log's map; None without the file."""
-    if not path.exists():
-        return None
-    try:
-        return read_lanes(path)
-    except SceneError as error:
-        raise LogError(str(error)) from error
+    lanes = None
+    if path.exists():
+        with left_out.damaged("maps"):
+            lanes = read_lanes(path)
+    return lanes
 
 
 def _load(manifest: Path) -> dict[str, Any]:
     try:
-        content = json.loads(manifest.read_text(encoding="utf-8"))
+        content = json.loads(read_text(manifest))
     except OSError as error:
         raise LogError(f"{manifest}: cannot be read ({error.strerror})") from error
     except ValueError as error:
@@ -141,17 +150,20 @@ class _JsonSection:
     def section(self, key: str) -> _JsonSection:
         return _JsonSection(self.get(key, dict), f"{self.where}: {key}")
 
-    def sections(self, key: str) -> list[_JsonSection]:
+    def sections(self, key: str, left_out: LeftOut) -> list[_JsonSection]:
         found = []
         for i, item in enumerate(self.get(key, list)):
             where = f"{self.where}: {key}[{i}]"
-            if not isinstance(item, dict):
-                raise LogError(f"{where} must be an object, found {item!r}")
-            found.append(_JsonSection(item, where))
+            if isinstance(item, dict):
+                found.append(_JsonSection(item, where))
+            else:
+                left_out.add(key, f"{where} must be an object, found {item!r}")
         return found
 
-    def numbers(self, key: str, shape: tuple[int, ...]) -> NDArray[np.float64]:
-        """Finite float64 array; -1 in ``shape`` matches any length."""
+    def numbers(
+        self, key: str, shape: tuple[int, ...], *, finite: bool = True
+    ) -> NDArray[np.float64]:
+        """Float64 array; -1 in ``shape`` matches any length."""
         try:
             values = np.array(self.get(key, list), dtype=np.float64)
         except (ValueError, TypeError) as error:
@@ -164,7 +176,7 @@ class _JsonSection:
         if not fits:
             wanted = [n if n >= 0 else "N" for n in shape]
             raise LogError(f"{self.where}: {key!r} must be {wanted}, not {list(values.shape)}")
-        if not np.isfinite(values).all():
+        if finite and not np.isfinite(values).all():
             raise LogError(f"{self.where}: {key!r} holds a value that is not finite")
         return values
 
@@ -184,24 +196,24 @@ class _JsonSection:
         return length, width, height
 
 
-def _read_rig(content: _JsonSection) -> CameraRig:
-    cameras = []
-    for entry in content.sections("cameras"):
-        name = entry.only(CAMERA_KEYS).get("name", str)
-        if not name or Path(name).name != name:
-            raise LogError(f"{entry.where}: 'name' must be usable as a folder name, not {name!r}")
-        k, pose = entry.numbers("K", (3, 3)), entry.numbers("T_vehicle_camera", (4, 4))
-        try:
-            size = entry.get("width", int), entry.get("height", int)
-            cameras.append(Camera(name, *size, k, pose, recorded=_read_optics(entry)))
-        except (SceneError, ValidationError) as error:
-            raise LogError(f"{entry.where}: {error}") from error
-    if not cameras:
-        raise LogError(f"{content.where}: 'cameras' must name at least one camera")
-    try:
-        return CameraRig(tuple(cameras))
-    except SceneError as error:
-        raise LogError(f"{content.where}: {error}") from error
+def _read_rig(content: _JsonSection, left_out: LeftOut) -> CameraRig:
+    cameras: dict[str, Camera] = {}
+    for entry in content.sections("cameras", left_out):
+        entry.only(CAMERA_KEYS)
+        with left_out.damaged("cameras"):
+            name = entry.get("name", str)
+            if not name or Path(name).name != name or name in cameras:
+                raise LogError(
+                    f"{entry.where}: 'name' must be usable as a folder name, and only once, not "
+                    f"{name!r}"
+                )
+            k, pose = entry.numbers("K", (3, 3)), entry.numbers("T_vehicle_camera", (4, 4))
+            try:
+                size = entry.get("width", int), entry.get("height", int)
+                cameras[name] = Camera(name, *size, k, pose, recorded=_read_optics(entry))
+            except (SceneError, ValidationError) as error:
+                raise LogError(f"{entry.where}: {error}") from error
+    return CameraRig(tuple(cameras.values()))
 
 
 def _read_optics(entry: _JsonSection) -> Optics | None:
@@ -210,65 +222,78 @@ def _read_optics(entry: _JsonSection) -> Optics | None:
     return None if given is None else OpticsPart.model_validate(given).build()
 
 
-def _read_trajectory(section: _JsonSection) -> Trajectory:
+def _read_trajectory(section: _JsonSection, left_out: LeftOut, kind: str) -> Trajectory:
+    """The poses of a section; those that are not finite, or not in order, are left out."""
     times_us = section.integers("times_us")
-    positions = section.numbers("positions", (-1, 3))
-    quaternions = section.numbers("quaternions", (-1, 4))
+    positions = section.numbers("positions", (-1, 3), finite=False)
+    quaternions = section.numbers("quaternions", (-1, 4), finite=False)
+    if not len(times_us) == len(positions) == len(quaternions):
+        raise LogError(
+            f"{section.where}: has {len(times_us)} times, {len(positions)} positions and "
+            f"{len(quaternions)} quaternions"
+        )
+    norms = np.linalg.norm(quaternions, axis=1)
+    kept: list[int] = []
+    for i, t_us in enumerate(times_us.tolist()):
+        where = f"{section.where}, pose {i} at {t_us} us"
+        if not (np.isfinite(positions[i]).all() and abs(norms[i] - 1) < QUATERNION_TOLERANCE):
+            left_out.add(kind, f"{where}: is not finite, or its quaternion not of unit length")
+        elif kept and t_us <= times_us[kept[-1]]:
+            left_out.add(kind, f"{where}: does not come after the pose before")
+        else:
+            kept.append(i)
     try:
-        return Trajectory(times_us, positions, quaternions)
+        return Trajectory(times_us[kept], positions[kept], quaternions[kept])
     except SceneError as error:
         raise LogError(f"{section.where}: {error}") from error
 
 
-def _read_tracks(content: _JsonSection) -> tuple[ObjectTrack, ...]:
+def _read_tracks(content: _JsonSection, left_out: LeftOut) -> tuple[ObjectTrack, ...]:
     tracks: dict[str, ObjectTrack] = {}
-    for entry in content.sections("tracks"):
-        object_id = entry.only(TRACK_KEYS).get("object_id", str)
-        if not object_id or object_id in tracks:
-            raise LogError(f"{entry.where}: 'object_id' {object_id!r} is empty or used twice")
-        tracks[object_id] = ObjectTrack(
-            object_id=object_id,
-            category=entry.get("category", str),
-            size=entry.size("size"),
-            trajectory=_read_trajectory(entry),
-        )
+    for entry in content.sections("tracks", left_out):
+        entry.only(TRACK_KEYS)
+        with left_out.damaged("objects"):
+            object_id = entry.get("object_id", str)
+            if not object_id or object_id in tracks:
+                raise LogError(f"{entry.where}: 'object_id' {object_id!r} is empty or used twice")
+            tracks[object_id] = ObjectTrack(
+                object_id=object_id,
+                category=entry.get("category", str),
+                size=entry.size("size"),
+                trajectory=_read_trajectory(entry, left_out, "boxes"),
+            )
     return tuple(tracks.values())
 
 
 def _read_image_times(
-    content: _JsonSection, rig: CameraRig, times_us: NDArray[np.int64], ego: Trajectory
+    content: _JsonSection, rig: CameraRig, times_us: NDArray[np.int64], left_out: LeftOut
 ) -> dict[str, NDArray[np.int64]]:
     """Times of images by camera; the key and any camera are optional."""
     if "image_times_us" not in content.content:
         return {}
     section, found = content.section("image_times_us"), {}
     for name in section.content:
-        where = f"{section.where}: {name}"
-        if name not in rig.names:
-            raise LogError(f"{where}: there is no such camera")
-        given = check_frame_times(section.integers(name), where)
-        if len(given) != len(times_us):
-            raise LogError(f"{where}: {len(given)} times for {len(times_us)} frames")
-        check_ego_covers(ego, given, where)
-        found[name] = given
+        with left_out.damaged("times"):
+            where = f"{section.where}: {name}"
+            if name not in rig.names:
+                raise LogError(f"{where}: there is no usable camera of this name")
+            given = check_frame_times(section.integers(name), where)
+            if len(given) != len(times_us):
+                raise LogError(f"{where}: {len(given)} times for {len(times_us)} frames")
+            found[name] = given
     return found
 
 
-def _image_files(path: Path, rig: CameraRig, frame_count: int) -> dict[str, list[Path]]:
+def _image_files(path: Path, rig: CameraRig, frames: NDArray[np.intp]) -> dict[str, list[Path]]:
     images = {}
     for camera in rig:
         folder = path / "images" / camera.name
-        if not folder.is_dir():
-            raise LogError(f"{folder}: no such folder; camera {camera.name!r} needs its images")
-        suffix = next((s for s in IMAGE_SUFFIXES if (folder / f"000000{s}").exists()), ".png")
-        images[camera.name] = [folder / f"{f:06d}{suffix}" for f in range(frame_count)]
+        suffix = next(
+            (p.suffix for p in sorted(folder.glob("*")) if p.suffix.lower() in IMAGE_SUFFIXES),
+            ".png",
+        )
+        images[camera.name] = [folder / f"{f:06d}{suffix}" for f in frames]
     return images
-
-
-def _sweep_files(path: Path, content: _JsonSection, frame_count: int) -> list[Path] | None:
-    if not content.get("lidar", bool):
-        return None
-    return [path / "lidar" / f"{f:06d}.npz" for f in range(frame_count)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -289,12 +314,7 @@ class _NativeSource:
 
     def lidar(self, frame: int) -> LidarSweep:
         if self.sweeps is None:
-            return LidarSweep(
-                points=np.zeros((0, 3), np.float32),
-                intensity=np.zeros(0, np.float32),
-                offset_us=np.zeros(0, np.int32),
-                origin=np.zeros(3, np.float32),
-            )
+            return NO_SWEEP
         return _read_sweep(self.sweeps[frame])
 
 
@@ -425,18 +445,20 @@ def _write_frames(
         (folder / name).mkdir(parents=True)
     for frame in range(log.frame_count):
         for camera in log.rig.names:
-            image = log.image(camera, frame)
-            write_image(folder / "images" / camera / f"{frame:06d}.{image_format}", image)
+            if log.has_image(camera, frame):
+                image = log.image(camera, frame)
+                write_image(folder / "images" / camera / f"{frame:06d}.{image_format}", image)
             done = _report(done, total, on_progress)
         sweep = log.lidar(frame)
         has_lidar |= len(sweep.points) > 0
-        np.savez(
-            folder / "lidar" / f"{frame:06d}.npz",
-            points=sweep.points,
-            intensity=sweep.intensity,
-            offset_us=sweep.offset_us,
-            origin=sweep.origin,
-        )
+        if frame not in log.absent_sweeps:
+            np.savez(
+                folder / "lidar" / f"{frame:06d}.npz",
+                points=sweep.points,
+                intensity=sweep.intensity,
+                offset_us=sweep.offset_us,
+                origin=sweep.origin,
+            )
         done = _report(done, total, on_progress)
     if not has_lidar:
         shutil.rmtree(folder / "lidar")

@@ -18,21 +18,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...geometry import Float, apply_transform, invert_transform, transform_from
-from ...scene import CameraRig, SceneError, Trajectory
-from ..driving_log import DrivingLog, LidarSweep, LogError, LoggedMap, ObjectTrack
+from ...scene import CameraRig, Trajectory
+from ..driving_log import NO_SWEEP, DrivingLog, LidarSweep, LogError, LoggedMap, ObjectTrack
 from .common import (
     FrameBox,
+    LeftOut,
     Lens,
-    MatchedImages,
     TimedImages,
     build_tracks,
+    covered_frames,
     match_images,
     select_sequence,
 )
-from .files import ImageFiles, Tables, check_ego_covers, check_frame_times, count_rows, read_rows
+from .files import ImageFiles, Tables, count_rows, read_rows
 
-LIDAR, FRONT = "LIDAR_TOP", "CAM_FRONT"
+LIDAR, CAMERA, FRONT = "LIDAR_TOP", "CAM_", "cam_front"
 TOLERANCE_US = 60_000
+MAX_GAP = 20
+"""Maximum number of frames into which a gap is divided."""
+MAX_TIME_US = 1e18
 HALF_SWEEP_US = 25_000
 COLUMNS = 5
 """Columns of a sweep's points: x, y, z, intensity, ring."""
@@ -73,34 +77,37 @@ class NuScenesReader:
             LogError: see :class:`LogReader`.
         """
         folder = sorted(p.parent for p in path.glob("v1.0-*/scene.json"))[0]
-        tables = Tables(folder, TABLES)
-        scenes = {str(s["name"]): str(s["token"]) for s in tables.rows("scene")}
+        left_out = LeftOut()
+        tables = Tables(folder, TABLES, left_out)
+        scenes = {str(s["name"]): s for s in tables.rows("scene") if "name" in s}
         name = select_sequence(folder / "scene.json", sorted(scenes), sequence)
-        samples = {s["token"] for s in tables.rows("sample") if s["scene_token"] == scenes[name]}
-        recordings = _recordings(tables, samples)
-        cameras = {c: r for c, r in recordings.items() if c.startswith("CAM_")}
-        if FRONT not in cameras or LIDAR not in recordings:
-            raise LogError(f"{tables.path('sample_data')}: {name!r} needs {FRONT} and {LIDAR}")
-        front, matched = _match(path, folder, recordings)
-        times_us = front[matched.frames]
-        sweeps, sweep_times = matched.files.pop(LIDAR), matched.times_us.pop(LIDAR)
-        ego = _ego(tables, recordings.values(), int(times_us[0]))
-        check_ego_covers(ego.in_log, times_us, str(tables.path("ego_pose")))
-        lenses = {c.lower(): _lens(tables, r, c) for c, r in cameras.items()}
-        images = ImageFiles(matched.files, lenses)
-        tracks, keys = _tracks(tables, samples, ego.to_log)
+        samples = _samples(tables, scenes[name]["token"], left_out)
+        recordings = _recordings(tables, samples, left_out)
+        lenses, mounts = _calibration(tables, recordings, left_out)
+        timed = {c: TimedImages(recordings[c].files(path), recordings[c].times_us) for c in mounts}
+        if not lenses:
+            raise LogError(f"{tables.path('sample_data')}: {name!r} has no usable camera")
+        reference = max(lenses, key=lambda c: (c == FRONT, len(timed[c].times_us)))
+        given = _without_gaps(timed[reference].times_us)
+        ego = _ego(tables, recordings.values(), given, left_out)
+        frames = covered_frames(ego.in_log, given, left_out, str(tables.path("ego_pose")))
+        times_us = given[frames]
+        matched = match_images(
+            times_us, timed, tolerance_us=TOLERANCE_US, left_out=left_out, where=folder
+        )
+        tracks, keys = _tracks(tables, samples, ego.to_log, left_out)
         return DrivingLog(
             name=f"nuscenes_{name}",
-            rig=_rig(tables, cameras, lenses),
+            rig=_rig(lenses, mounts),
             frame_times_us=times_us,
             ego=ego.in_log,
             tracks=tracks,
             source=_NuScenesSource(
-                images=images,
-                sweeps=sweeps,
-                sweep_times_us=sweep_times,
+                images=ImageFiles(matched.files, lenses),
+                sweeps=matched.files.get(LIDAR),
+                sweep_times_us=matched.times_us.get(LIDAR, times_us),
                 frame_times_us=times_us,
-                T_vehicle_lidar=_mount(tables, recordings[LIDAR]),
+                T_vehicle_lidar=mounts.get(LIDAR, np.eye(4)),
                 ego=ego.in_log,
             ),
             ego_size=EGO_SIZE,
@@ -111,35 +118,53 @@ class NuScenesReader:
                 "reader": self.name,
                 "track_ids": keys,
                 "T_world_dataset": ego.to_log.tolist(),
-                "frames_without_all_images": len(front) - len(times_us),
             },
-            image_times_us=matched.times_us,
-            logged_map=_find_map(path, folder, tables.row("scene", scenes[name]), ego.to_log),
+            image_times_us={c: matched.times_us[c] for c in lenses},
+            absent_images=frozenset((c, i) for c, i in matched.absent if c != LIDAR),
+            absent_sweeps=frozenset(i for c, i in matched.absent if c == LIDAR),
+            left_out=left_out.told(),
+            logged_map=_find_map(path, folder, scenes[name], ego.to_log),
         )
+
+
+def _without_gaps(times_us: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Times of images, and evenly spaced ones where images are missing in between."""
+    steps = np.diff(times_us)
+    counts = np.rint(steps / np.median(steps)).astype(int) if len(steps) else steps
+    filled = [times_us[:1]]
+    for time_us, step, count in zip(times_us[:-1], steps, np.clip(counts, 1, None), strict=True):
+        filled.append(time_us + step * np.arange(1, min(count, MAX_GAP) + 1) // min(count, MAX_GAP))
+    return np.concatenate(filled)
 
 
 def _find_map(
     root: Path, folder: Path, scene: Mapping[str, Any], T_world_map: Float
 ) -> LoggedMap | None:
     """The map expansion of a scene's location, if it was unpacked next to the tables."""
-    if not (folder / "log.json").is_file():
+    try:
+        log = Tables(folder, ("log",), LeftOut()).row("log", str(scene["log_token"]))
+        name = Path(str(log["location"])).name
+    except LogError:
         return None
-    log = Tables(folder, ("log",)).row("log", str(scene["log_token"]))
-    path = root / "maps" / "expansion" / f"{Path(str(log['location'])).name}.json"
+    path = root / "maps" / "expansion" / f"{name}.json"
     return LoggedMap(path, T_world_map) if path.is_file() else None
 
 
-def _match(
-    root: Path, folder: Path, recordings: Mapping[str, _Recording]
-) -> tuple[NDArray[np.int64], MatchedImages]:
-    """Times of all images of the front camera, and the images and sweeps nearest to them."""
-    front = check_frame_times(recordings[FRONT].times_us, f"{folder / 'sample_data.json'}")
-    timed = {
-        (c if c == LIDAR else c.lower()): TimedImages(r.files(root), r.times_us)
-        for c, r in recordings.items()
-        if c == LIDAR or c.startswith("CAM_")
-    }
-    return front, match_images(front, timed, tolerance_us=TOLERANCE_US, where=folder)
+def _samples(tables: Tables, scene: str, left_out: LeftOut) -> dict[str, int]:
+    """Times of the samples of a scene [us], by token."""
+    times = {}
+    for row in tables.rows("sample"):
+        with left_out.damaged("samples"):
+            if row["scene_token"] == scene:
+                times[row["token"]] = _time_us(tables, "sample", row)
+    return times
+
+
+def _time_us(tables: Tables, table: str, row: Mapping[str, Any]) -> int:
+    value = row["timestamp"]
+    if not isinstance(value, int | float) or not abs(value) < MAX_TIME_US:
+        raise LogError(f"{tables.path(table)}: {row['token']!r}: timestamp {value!r} is no time")
+    return int(value)
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,69 +172,93 @@ class _Recording:
     """Rows of ``sample_data`` of one sensor, by time."""
 
     rows: Sequence[Mapping[str, Any]]
-
-    @property
-    def times_us(self) -> NDArray[np.int64]:
-        return np.array([row["timestamp"] for row in self.rows], dtype=np.int64)
+    times_us: NDArray[np.int64]
 
     def files(self, root: Path) -> list[Path]:
-        return [root / row["filename"] for row in self.rows]
+        return [root / str(row["filename"]).replace("\\", "/") for row in self.rows]
 
 
-def _recordings(tables: Tables, samples: set[str]) -> dict[str, _Recording]:
-    channels = {}
-    for sensor in tables.rows("calibrated_sensor"):
-        channels[sensor["token"]] = tables.row("sensor", sensor["sensor_token"])["channel"]
-    rows: dict[str, list[Mapping[str, Any]]] = defaultdict(list)
+def _recordings(
+    tables: Tables, samples: Mapping[str, int], left_out: LeftOut
+) -> dict[str, _Recording]:
+    known = {row["token"] for row in tables.rows("sample")}
+    found: dict[str, dict[int, Mapping[str, Any]]] = defaultdict(dict)
     for row in tables.rows("sample_data"):
-        if row["sample_token"] in samples:
-            sensor = tables.row("calibrated_sensor", row["calibrated_sensor_token"])
-            rows[channels[sensor["token"]]].append(row)
+        with left_out.damaged("recordings"):
+            where = f"{tables.path('sample_data')}: {row['token']!r}"
+            if row["sample_token"] not in known:
+                raise LogError(f"{where}: has no sample {row['sample_token']!r}")
+            if row["sample_token"] not in samples:
+                continue
+            mount = tables.row("calibrated_sensor", row["calibrated_sensor_token"])
+            channel = str(tables.row("sensor", mount["sensor_token"])["channel"])
+            channel = channel.lower() if channel.startswith(CAMERA) else channel
+            time_us, _ = _time_us(tables, "sample_data", row), row["filename"]
+            if time_us in found[channel]:
+                raise LogError(f"{where}: {channel} has two recordings at {time_us} us")
+            found[channel][time_us] = row
     return {
-        channel: _Recording(sorted(found, key=lambda r: int(r["timestamp"])))
-        for channel, found in sorted(rows.items())
+        channel: _Recording(
+            [by_time[t] for t in sorted(by_time)], np.array(sorted(by_time), dtype=np.int64)
+        )
+        for channel, by_time in sorted(found.items())
+        if by_time
     }
 
 
-def _lens(tables: Tables, recording: _Recording, channel: str) -> Lens:
-    row = recording.rows[0]
-    given = tables.row("calibrated_sensor", row["calibrated_sensor_token"])["camera_intrinsic"]
-    k = np.array(given, dtype=np.float64)
-    if k.shape != (3, 3) or not np.isfinite(k).all():
-        raise LogError(f"{tables.path('calibrated_sensor')}: {channel} needs a 3x3 matrix")
+def _calibration(
+    tables: Tables, recordings: Mapping[str, _Recording], left_out: LeftOut
+) -> tuple[dict[str, Lens], dict[str, Float]]:
+    """Lenses by camera, and ``T_vehicle_sensor`` [4, 4] of cameras and LiDAR."""
+    lenses, mounts = {}, {}
+    for channel, recording in recordings.items():
+        is_camera = channel.startswith(CAMERA.lower())
+        if not is_camera and channel != LIDAR:
+            continue
+        row = recording.rows[0]
+        mount = tables.row("calibrated_sensor", row["calibrated_sensor_token"])
+        with left_out.damaged("cameras" if is_camera else "LiDARs"):
+            pose = _pose(tables, "calibrated_sensor", mount)
+            if is_camera:
+                lens = _lens(tables, row, mount)
+                lens.camera(channel, pose)
+                lenses[channel] = lens
+            mounts[channel] = pose
+    return lenses, mounts
+
+
+def _lens(tables: Tables, row: Mapping[str, Any], mount: Mapping[str, Any]) -> Lens:
+    where = f"{tables.path('calibrated_sensor')}: {mount['token']!r}"
+    try:
+        k = np.array(mount["camera_intrinsic"], dtype=np.float64)
+        width, height = int(row["width"]), int(row["height"])
+    except (TypeError, ValueError) as error:
+        raise LogError(f"{where}: its intrinsics or image size are no numbers ({error})") from error
+    if k.shape != (3, 3) or not np.isfinite(k).all() or min(k[0, 0], k[1, 1]) <= 0:
+        raise LogError(f"{where}: camera_intrinsic must be a 3x3 matrix, not {k.tolist()}")
+    if min(width, height) < 1:
+        raise LogError(f"{where}: its images are {width}x{height}")
     k[:2, 2] += 0.5
-    return Lens(int(row["width"]), int(row["height"]), k)
-
-
-def _mount(tables: Tables, recording: _Recording) -> Float:
-    """``T_vehicle_sensor`` [4, 4]."""
-    token = recording.rows[0]["calibrated_sensor_token"]
-    return _pose(tables, "calibrated_sensor", tables.row("calibrated_sensor", token))
+    return Lens(width, height, k)
 
 
 def _pose(tables: Tables, table: str, row: Mapping[str, Any]) -> Float:
-    position = np.array(row["translation"], dtype=np.float64)
-    quaternion = np.array(row["rotation"], dtype=np.float64)
+    where = f"{tables.path(table)}: {row['token']!r}"
+    try:
+        position = np.array(row["translation"], dtype=np.float64)
+        quaternion = np.array(row["rotation"], dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise LogError(f"{where}: the pose holds no numbers ({error})") from error
     length = np.linalg.norm(quaternion)
     if position.shape != (3,) or quaternion.shape != (4,) or not abs(length - 1) < 1e-2:
-        raise LogError(f"{tables.path(table)}: {row['token']!r}: the pose is not rigid")
+        raise LogError(f"{where}: the pose is not rigid")
     if not np.isfinite(position).all():
-        raise LogError(f"{tables.path(table)}: {row['token']!r}: the pose is not finite")
+        raise LogError(f"{where}: the pose is not finite")
     return transform_from(position, quaternion)
 
 
-def _rig(
-    tables: Tables, cameras: Mapping[str, _Recording], lenses: Mapping[str, Lens]
-) -> CameraRig:
-    try:
-        return CameraRig(
-            tuple(
-                lens.camera(c.lower(), _mount(tables, r))
-                for (c, r), lens in zip(cameras.items(), lenses.values(), strict=True)
-            )
-        )
-    except SceneError as error:
-        raise LogError(f"{tables.path('calibrated_sensor')}: {error}") from error
+def _rig(lenses: Mapping[str, Lens], mounts: Mapping[str, Float]) -> CameraRig:
+    return CameraRig(tuple(lens.camera(c, mounts[c]) for c, lens in lenses.items()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,48 +269,59 @@ class _Ego:
     to_log: Float
 
 
-def _ego(tables: Tables, recordings: Iterable[_Recording], start_us: int) -> _Ego:
+def _ego(
+    tables: Tables,
+    recordings: Iterable[_Recording],
+    times_us: NDArray[np.int64],
+    left_out: LeftOut,
+) -> _Ego:
     """The ego path through the poses of all recordings of the scene."""
-    where = tables.path("ego_pose")
-    poses: dict[int, Mapping[str, Any]] = {}
+    poses: dict[int, Float] = {}
     for recording in recordings:
         for row in recording.rows:
-            pose = tables.row("ego_pose", row["ego_pose_token"])
-            poses.setdefault(int(pose["timestamp"]), pose)
+            with left_out.damaged("poses"):
+                pose = tables.row("ego_pose", str(row["ego_pose_token"]))
+                time_us = _time_us(tables, "ego_pose", pose)
+                if time_us not in poses:
+                    poses[time_us] = _pose(tables, "ego_pose", pose)
+    if not poses:
+        raise LogError(f"{tables.path('ego_pose')}: has no pose of this scene")
     times = sorted(poses)
-    try:
-        path = Trajectory.from_transforms(
-            times, np.array([_pose(tables, "ego_pose", poses[t]) for t in times])
-        )
-    except SceneError as error:
-        raise LogError(f"{where}: {error}") from error
-    check_ego_covers(path, np.array([start_us]), str(where))
-    to_log = invert_transform(path.transform(start_us))
+    path = Trajectory.from_transforms(times, np.array([poses[t] for t in times]))
+    covered = times_us[(times_us >= path.start_us) & (times_us <= path.end_us)]
+    to_log = invert_transform(path.transform(int(covered[0]) if len(covered) else path.start_us))
     return _Ego(path.moved(to_log), to_log)
 
 
 def _tracks(
-    tables: Tables, samples: set[str], to_log: Float
+    tables: Tables, samples: Mapping[str, int], to_log: Float, left_out: LeftOut
 ) -> tuple[tuple[ObjectTrack, ...], dict[str, str]]:
-    times = {s["token"]: int(s["timestamp"]) for s in tables.rows("sample")}
+    known = {row["token"] for row in tables.rows("sample")}
     boxes = []
     for row in tables.rows("sample_annotation"):
-        if row["sample_token"] not in samples:
-            continue
-        instance = tables.row("instance", row["instance_token"])
-        name = str(tables.row("category", instance["category_token"])["name"])
-        width, length, height = (float(v) for v in row["size"])
-        boxes.append(
-            FrameBox(
-                key=str(row["instance_token"]),
-                category=_category(name),
-                size=(length, width, height),
-                time_us=times[row["sample_token"]],
-                T_world_object=to_log @ _pose(tables, "sample_annotation", row),
-                where=f"{tables.path('sample_annotation')}: {row['token']!r}",
+        with left_out.damaged("boxes"):
+            where = f"{tables.path('sample_annotation')}: {row['token']!r}"
+            if row["sample_token"] not in known:
+                raise LogError(f"{where}: has no sample {row['sample_token']!r}")
+            if row["sample_token"] not in samples:
+                continue
+            instance = tables.row("instance", row["instance_token"])
+            name = str(tables.row("category", instance["category_token"])["name"])
+            try:
+                width, length, height = (float(v) for v in row["size"])
+            except (TypeError, ValueError) as error:
+                raise LogError(f"{where}: size must be three numbers ({error})") from error
+            boxes.append(
+                FrameBox(
+                    key=str(row["instance_token"]),
+                    category=_category(name),
+                    size=(length, width, height),
+                    time_us=samples[row["sample_token"]],
+                    T_world_object=to_log @ _pose(tables, "sample_annotation", row),
+                    where=where,
+                )
             )
-        )
-    return build_tracks(boxes)
+    return build_tracks(boxes, left_out)
 
 
 def _category(name: str) -> str:
@@ -274,7 +334,7 @@ def _category(name: str) -> str:
 @dataclass(frozen=True, eq=False)
 class _NuScenesSource:
     images: ImageFiles
-    sweeps: Sequence[Path]
+    sweeps: Sequence[Path] | None
     sweep_times_us: NDArray[np.int64]
     frame_times_us: NDArray[np.int64]
     T_vehicle_lidar: Float
@@ -289,9 +349,11 @@ class _NuScenesSource:
 
     def check_sweep(self, frame: int) -> int:
         """See :class:`ChecksFiles`."""
-        return count_rows(self.sweeps[frame], COLUMNS)
+        return 0 if self.sweeps is None else count_rows(self.sweeps[frame], COLUMNS)
 
     def lidar(self, frame: int) -> LidarSweep:
+        if self.sweeps is None:
+            return NO_SWEEP
         rows = read_rows(self.sweeps[frame], COLUMNS)
         rows = rows[np.isfinite(rows[:, :4]).all(axis=1)]
         frame_us, sweep_us = int(self.frame_times_us[frame]), int(self.sweep_times_us[frame])

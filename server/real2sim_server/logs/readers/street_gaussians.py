@@ -15,7 +15,7 @@ import threading
 import zipfile
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import IO, Any, Final
 
@@ -26,15 +26,18 @@ from ..._confined import ConfinedError, Limits, run_confined
 from ...geometry import Float
 from ...scene.camera import T_VEHICLE_OPTICAL
 from ..driving_log import DrivingLog, LidarSweep, LogError
-from ..images import image_size
+from ..images import common_size
+from .common import LeftOut
 from .files import ImageFiles, check_rigid, parse_numbers, read_json, read_lines
 from .waymo_common import (
     CAMERA_NAMES,
+    MAX_TIME_S,
     WaymoBox,
     WaymoCamera,
     WaymoFrame,
     WaymoImage,
     build_waymo_log,
+    usable_frames,
     waymo_camera,
 )
 
@@ -275,8 +278,8 @@ def _key(key: Any) -> int | str:
     raise ValueError(f"the name of an array is a {type(key).__name__}, no number or text")
 
 
+MAX_FRAMES = 1_000_000
 TYPES = {"vehicle": 1, "pedestrian": 2, "sign": 3, "cyclist": 4, "misc": 0}
-MAX_TIME_S = 1e12
 LASER = (1.43, 0.0, 2.184)
 """Position of Waymo's TOP laser on the vehicle [m]; it is not in the folder."""
 
@@ -302,38 +305,45 @@ class StreetGaussiansReader:
         """
         if sequence is not None:
             raise LogError(f"{path}: holds one drive; it has no sequence {sequence!r}")
-        count = _frame_count(path / "ego_pose")
-        times = _Times(path / "timestamps.json")
-        cameras = [_read_camera(path, i) for i in _camera_indices(path / "intrinsics")]
-        files = {c.name: _image_files(path, c.number - 1, count) for c in cameras}
-        files = {name: found for name, found in files.items() if found}
+        times, left_out = _Times(path / "timestamps.json"), LeftOut()
+        cameras = _read_cameras(path, left_out)
+        boxes = _read_boxes(path / "track" / "track_info.txt", left_out)
+        numbers = _frame_numbers(path / "ego_pose")
+        frames: list[WaymoFrame] = []
+        by_start: dict[int, int] = {}
+        for number in numbers:
+            with left_out.damaged("frames"):
+                frame = _read_frame(path, number, times, cameras, left_out)
+                frames.append(replace(frame, boxes=boxes.pop(number, ())))
+                by_start.setdefault(frame.start_us, number)
+        for number, lost in boxes.items():
+            for box in lost:
+                left_out.add("boxes", f"{box.where}: there is no usable frame {number}")
+        frames = usable_frames(frames, left_out, str(path))
+        numbers = [by_start[frame.start_us] for frame in frames]
+        files = {c.name: _image_files(path, c.number - 1, numbers) for c in cameras}
         images = ImageFiles(files, {c.name: c.lens for c in cameras})
-        boxes = _read_boxes(path / "track" / "track_info.txt")
-        used = [c for c in cameras if c.name in files]
-        frames = [_read_frame(path, i, times, used, boxes.get(i, ())) for i in range(count)]
         points = path / "pointcloud.npz"
         return build_waymo_log(
             name=f"street_gaussians_{path.resolve().name}",
             cameras=cameras,
             frames=frames,
-            source=_StreetSource(images, points if points.exists() else None),
+            source=_StreetSource(images, numbers, points if points.exists() else None),
             where=str(path),
             provenance={
                 "dataset": "Street Gaussians folder",
                 "sequence": path.resolve().name,
                 "reader": self.name,
             },
+            left_out=left_out,
         )
 
 
-def _frame_count(folder: Path) -> int:
-    numbers = sorted(int(p.stem) for p in folder.glob("*.txt") if re.fullmatch(r"\d+", p.stem))
-    if not numbers:
+def _frame_numbers(folder: Path) -> list[int]:
+    numbers = [int(p.stem) for p in folder.glob("*.txt") if p.stem.isdecimal()]
+    if not numbers or max(numbers) >= MAX_FRAMES:
         raise LogError(f"{folder}: holds no poses %06d.txt")
-    missing = sorted(set(range(numbers[-1] + 1)) - set(numbers))
-    if missing:
-        raise LogError(f"{folder / f'{missing[0]:06d}.txt'}: no such file ({len(missing)} missing)")
-    return len(numbers)
+    return list(range(max(numbers) + 1))
 
 
 class _Times:
@@ -355,23 +365,28 @@ class _Times:
         return round(value * 1e6)
 
 
-def _camera_indices(folder: Path) -> list[int]:
-    return sorted(int(p.stem) for p in folder.glob("*.txt") if p.stem.isdecimal())
-
-
-def _read_camera(path: Path, index: int) -> WaymoCamera:
-    intrinsics, extrinsics = (path / n / f"{index}.txt" for n in ("intrinsics", "extrinsics"))
-    images = sorted((path / "images").glob(f"*_{index}.*"))
-    # Without images the size is irrelevant: the camera is dropped.
-    size = image_size(images[0]) if images else (1, 1)
-    return waymo_camera(
-        index + 1,
-        size=size,
-        intrinsic=_numbers_of(intrinsics).tolist(),
-        extrinsic=_matrix(extrinsics) @ np.linalg.inv(T_VEHICLE_OPTICAL),
-        shutter=0,
-        where=str(intrinsics),
-    )
+def _read_cameras(path: Path, left_out: LeftOut) -> list[WaymoCamera]:
+    """Cameras with a calibration and images, by number."""
+    cameras = []
+    for intrinsics in (path / "intrinsics").glob("*.txt"):
+        with left_out.damaged("cameras"):
+            if not intrinsics.stem.isdecimal():
+                raise LogError(f"{intrinsics}: its name should be a camera's number")
+            index = int(intrinsics.stem)
+            images = sorted((path / "images").glob(f"*_{index}.*"))
+            if not images:
+                raise LogError(f"{path / 'images'}: camera {index} has no images")
+            extrinsics = path / "extrinsics" / intrinsics.name
+            camera = waymo_camera(
+                index + 1,
+                size=common_size(images),
+                intrinsic=_numbers_of(intrinsics).tolist(),
+                extrinsic=_matrix(extrinsics) @ np.linalg.inv(T_VEHICLE_OPTICAL),
+                shutter=0,
+                where=str(intrinsics),
+            )
+            cameras.append(camera)
+    return sorted(cameras, key=lambda camera: camera.number)
 
 
 def _numbers_of(path: Path) -> Float:
@@ -385,53 +400,59 @@ def _matrix(path: Path) -> Float:
     return check_rigid(numbers.reshape(4, 4), str(path))
 
 
-def _image_files(path: Path, camera: int, count: int) -> list[Path]:
-    """One file per frame; none if the camera has no image at all."""
-    found = sorted((path / "images").glob(f"*_{camera}.*"))
-    if not found:
-        return []
-    return [path / "images" / f"{frame:06d}_{camera}{found[0].suffix}" for frame in range(count)]
+def _image_files(path: Path, camera: int, numbers: Sequence[int]) -> list[Path]:
+    """One file per frame; it need not exist."""
+    suffix = next((path / "images").glob(f"*_{camera}.*")).suffix
+    return [path / "images" / f"{number:06d}_{camera}{suffix}" for number in numbers]
 
 
 def _read_frame(
-    path: Path, frame: int, times: _Times, cameras: Sequence[WaymoCamera], boxes: Sequence[WaymoBox]
+    path: Path, frame: int, times: _Times, cameras: Sequence[WaymoCamera], left_out: LeftOut
 ) -> WaymoFrame:
     start_us = times.time_us("FRAME", frame)
     pose = _matrix(path / "ego_pose" / f"{frame:06d}.txt")
     assert start_us is not None
     images = {}
     for camera in cameras:
-        time_us = times.time_us(CAMERA_NAMES[camera.number].upper(), frame)
-        file = path / "ego_pose" / f"{frame:06d}_{camera.number - 1}.txt"
-        own = _matrix(file) if file.exists() else pose
-        images[camera.number] = WaymoImage(start_us if time_us is None else time_us, own, 0.0)
-    return WaymoFrame(start_us, pose, images, boxes)
+        own, time_us = pose, start_us
+        with left_out.damaged("times"):
+            sensor = CAMERA_NAMES[camera.number].upper()
+            time_us = times.time_us(sensor, frame) or start_us
+        with left_out.damaged("poses"):
+            file = path / "ego_pose" / f"{frame:06d}_{camera.number - 1}.txt"
+            own = _matrix(file) if file.exists() else pose
+        images[camera.number] = WaymoImage(time_us, own, 0.0)
+    return WaymoFrame(start_us, pose, images)
 
 
-def _read_boxes(path: Path) -> Mapping[int, list[WaymoBox]]:
+def _read_boxes(path: Path, left_out: LeftOut) -> dict[int, list[WaymoBox]]:
     boxes: dict[int, list[WaymoBox]] = defaultdict(list)
     if not path.exists():
         return boxes
     for number, line in enumerate(read_lines(path)[1:], start=2):
         words, where = line.split(), f"{path} line {number}"
-        if len(words) != 12:
-            raise LogError(
-                f"{where}: expected 12 columns (frame track class alpha height width length "
-                f"x y z heading speed), found {len(words)}"
+        if not words:
+            continue
+        with left_out.damaged("boxes"):
+            if len(words) < 12:
+                raise LogError(
+                    f"{where}: expected 12 columns (frame track class alpha height width length "
+                    f"x y z heading speed), found {len(words)}"
+                )
+            if words[2] not in TYPES:
+                raise LogError(f"{where}: unknown class {words[2]!r}; known are {list(TYPES)}")
+            height, width, length, x, y, z, heading = parse_numbers(words[4:11], where).tolist()
+            box = WaymoBox(
+                words[1], TYPES[words[2]], (x, y, z), (length, width, height), heading, where
             )
-        if words[2] not in TYPES:
-            raise LogError(f"{where}: unknown class {words[2]!r}; known are {list(TYPES)}")
-        height, width, length, x, y, z, heading = parse_numbers(words[4:11], where).tolist()
-        box = WaymoBox(
-            words[1], TYPES[words[2]], (x, y, z), (length, width, height), heading, where
-        )
-        boxes[int(parse_numbers(words[:1], where)[0])].append(box)
+            boxes[int(parse_numbers(words[:1], where)[0])].append(box)
     return boxes
 
 
 @dataclass(frozen=True, eq=False)
 class _StreetSource:
     images: ImageFiles
+    numbers: Sequence[int]
     points: Path | None
     _lock: threading.Lock = field(default_factory=threading.Lock)
     _clouds: dict[str, Mapping[Any, NDArray[Any]]] = field(default_factory=dict)
@@ -448,7 +469,7 @@ class _StreetSource:
         return len(self.lidar(frame).points)
 
     def lidar(self, frame: int) -> LidarSweep:
-        points = np.zeros((0, 3)) if self.points is None else self._cloud(frame)
+        points = np.zeros((0, 3)) if self.points is None else self._cloud(self.numbers[frame])
         n = len(points)
         return LidarSweep(
             points=points.astype(np.float32),

@@ -9,7 +9,7 @@ the frame's time in the log. Pixel centres are at +0.5, as in a Camera.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ from ...geometry import Float, apply_transform, invert_transform
 from ...scene import Camera, CameraRig, Shutter, Trajectory
 from ...scene.camera import DIRECTIONS, GLOBAL, MAX_READOUT_US, T_VEHICLE_OPTICAL
 from ..driving_log import DrivingLog, FrameSource, LidarSweep, LogError
-from .common import FrameBox, Lens, build_tracks, upright_pose
+from .common import FrameBox, LeftOut, Lens, build_tracks, upright_pose
 from .files import check_frame_times, check_rigid
 
 # --- Range images --------------------------------------------------------------------------------
@@ -40,12 +40,23 @@ class Laser:
         inclinations: [N] float64 [rad], ascending; or None, then ``limits`` are divided evenly.
         limits: (lowest, highest) inclination [rad].
         T_vehicle_laser: [4, 4].
+
+    Raises:
+        LogError: a value is not finite, or the pose not rigid.
     """
 
     number: int
     inclinations: Float | None
     limits: tuple[float, float]
     T_vehicle_laser: Float
+
+    def __post_init__(self) -> None:
+        where = f"calibration of laser {self.number}"
+        check_rigid(self.T_vehicle_laser, where)
+        if not np.isfinite(
+            [*self.limits, *(() if self.inclinations is None else self.inclinations)]
+        ).all():
+            raise LogError(f"{where}: holds an inclination that is not finite")
 
     def rows(self, height: int, where: str) -> Float:
         """Inclination [height] of each row of a range image; the first row is the highest.
@@ -192,6 +203,9 @@ EGO_SIZE = (5.18, 2.05, 1.78)
 """Chrysler Pacifica without its roof sensors [m]."""
 
 SWEEP_US = 100_000
+MAX_TIME_S = 1e12
+MAX_DELAY_US = 1_000_000
+"""Maximum time between the time stamp of a frame and its images [us]."""
 LICENCE = "Waymo Open Dataset terms, non-commercial"
 
 
@@ -274,14 +288,14 @@ class WaymoFrame:
         pose: ``T_world_vehicle`` [4, 4], in Waymo's world.
         images: images by camera number.
         boxes: LiDAR boxes.
-        lasers: numbers of the lasers with a range image.
+        has_sweep: whether there is a range image of the TOP laser, which has most of the points.
     """
 
     start_us: int
     pose: Float
     images: Mapping[int, WaymoImage] = field(default_factory=dict)
     boxes: Sequence[WaymoBox] = ()
-    lasers: frozenset[int] = frozenset()
+    has_sweep: bool = True
 
     @property
     def time_us(self) -> int:
@@ -290,23 +304,40 @@ class WaymoFrame:
         return front.time_us if front is not None else self.start_us + SWEEP_US // 2
 
 
-def with_sweeps(frames: Sequence[WaymoFrame]) -> tuple[list[int], list[WaymoFrame]]:
-    """Indices of frames with a sweep (all in a segment without LiDAR), and of the others.
-
-    A frame without the TOP laser, which has most of the points, counts as one without a sweep.
-    """
-    there = frozenset[int]().union(*(f.lasers for f in frames))
-    needed = there & {TOP} or there
-    lost = [bool(needed) and not f.lasers & needed for f in frames]
-    kept = [i for i, is_lost in enumerate(lost) if not is_lost]
-    return kept, [f for f, is_lost in zip(frames, lost, strict=True) if is_lost]
-
-
 def sweep_timings(frames: Sequence[WaymoFrame]) -> list[SweepTiming]:
     """Sweep times of the TOP laser, by frame."""
     starts = np.array([f.start_us for f in frames])
     duration = float(np.median(np.diff(starts))) if len(starts) > 1 else float(SWEEP_US)
     return [SweepTiming(f.start_us - f.time_us, duration) for f in frames]
+
+
+def usable_frames(frames: Sequence[WaymoFrame], left_out: LeftOut, where: str) -> list[WaymoFrame]:
+    """The frames in order of time, without those that have no rigid pose or no time of their own.
+
+    Images that were not taken at the time of their frame are dropped.
+
+    Raises:
+        LogError: there is none.
+    """
+    by_time: dict[int, WaymoFrame] = {}
+    for frame in frames:
+        kept = len(by_time)
+        with left_out.damaged("frames"):
+            check_rigid(frame.pose, f"{where}: vehicle pose at {frame.start_us} us")
+            if frame.start_us in by_time:
+                raise LogError(f"{where}: there is a second frame at {frame.start_us} us")
+            images = {
+                number: image
+                for number, image in frame.images.items()
+                if abs(image.time_us - frame.start_us) <= MAX_DELAY_US
+            }
+            by_time[frame.start_us] = replace(frame, images=images)
+        if len(by_time) == kept:
+            for box in frame.boxes:
+                left_out.add("boxes", f"{box.where}: its frame is left out")
+    if not by_time:
+        raise LogError(f"{where}: has no frame with a pose")
+    return [by_time[t] for t in sorted(by_time)]
 
 
 def build_waymo_log(
@@ -317,29 +348,52 @@ def build_waymo_log(
     source: FrameSource,
     where: str,
     provenance: Mapping[str, Any],
-    left_out: Sequence[WaymoFrame] = (),
+    left_out: LeftOut,
 ) -> DrivingLog:
     """The log; its world is the vehicle frame of the first frame.
 
     The ego's path passes through the poses of all frames and of all images. Cameras without any
-    image, and the frames ``left_out`` because they lack a sweep, are named in the provenance.
+    image are left out.
+
+    Args:
+        frames: of :func:`usable_frames`.
+        left_out: collects the records that are not used.
 
     Raises:
-        LogError: times out of order, poses that are not rigid, images or boxes that are missing
-            or wrong.
+        LogError: times out of order.
     """
     times_us = check_frame_times(np.array([f.time_us for f in frames], dtype=np.int64), where)
-    for frame in frames:
-        check_rigid(frame.pose, f"{where}: vehicle pose at {frame.start_us} us")
     to_first = invert_transform(frames[0].pose)
-    used = [c for c in cameras if any(c.number in f.images for f in frames)]
-    _check_complete(used, frames, where)
-    tracks, keys = build_tracks(_boxes(frames, to_first))
+    used = []
+    for camera in cameras:
+        if any(camera.number in f.images for f in frames):
+            with left_out.damaged("cameras"):
+                _camera(camera, frames)
+                used.append(camera)
+        else:
+            left_out.add("cameras", f"{where}: camera {camera.name!r} has no images")
+    absent = frozenset(
+        (camera.name, i)
+        for i, frame in enumerate(frames)
+        for camera in used
+        if camera.number not in frame.images
+    )
+    for i, frame in enumerate(frames):
+        for camera in used:
+            if (camera.name, i) in absent:
+                told = f"{camera.name!r} has no usable image in the frame of {frame.start_us} us"
+                left_out.add("images", f"{where}: camera {told}")
+    has_lidar = any(f.has_sweep for f in frames)
+    no_sweep = frozenset(i for i, f in enumerate(frames) if has_lidar and not f.has_sweep)
+    for i in sorted(no_sweep):
+        told = f"the frame of {frames[i].start_us} us has no sweep of the TOP laser"
+        left_out.add("sweeps", f"{where}: {told}")
+    tracks, keys = build_tracks(_boxes(frames, to_first, left_out), left_out)
     return DrivingLog(
         name=name,
         rig=CameraRig(tuple(_camera(c, frames) for c in used)),
         frame_times_us=times_us,
-        ego=_ego(frames, to_first, where),
+        ego=_ego(frames, to_first, left_out, where),
         tracks=tracks,
         source=source,
         ego_size=EGO_SIZE,
@@ -348,26 +402,18 @@ def build_waymo_log(
             "licence": LICENCE,
             "track_ids": keys,
             "rolling_shutter": {c.name: _shutter(c, frames) for c in used},
-            "cameras_without_images": [c.name for c in cameras if c not in used],
-            "frames_without_sweep_us": [f.time_us for f in left_out],
         },
         image_times_us={
-            c.name: np.array([f.images[c.number].time_us for f in frames], dtype=np.int64)
+            c.name: np.array(
+                [f.images[c.number].time_us if c.number in f.images else f.time_us for f in frames],
+                dtype=np.int64,
+            )
             for c in used
         },
+        absent_images=absent,
+        absent_sweeps=no_sweep,
+        left_out=left_out.told(),
     )
-
-
-def _check_complete(
-    cameras: Sequence[WaymoCamera], frames: Sequence[WaymoFrame], where: str
-) -> None:
-    for camera in cameras:
-        for frame in frames:
-            if camera.number not in frame.images:
-                raise LogError(
-                    f"{where}: camera {camera.name!r} has no image in the frame of "
-                    f"{frame.start_us} us; every frame needs one"
-                )
 
 
 def _camera(camera: WaymoCamera, frames: Sequence[WaymoFrame]) -> Camera:
@@ -379,23 +425,22 @@ def _camera(camera: WaymoCamera, frames: Sequence[WaymoFrame]) -> Camera:
     return camera.lens.camera(camera.name, camera.T_vehicle_camera, shutter)
 
 
-def _boxes(frames: Sequence[WaymoFrame], to_first: Float) -> list[FrameBox]:
+def _boxes(frames: Sequence[WaymoFrame], to_first: Float, left_out: LeftOut) -> list[FrameBox]:
     boxes = []
     for frame in frames:
         to_world = to_first @ frame.pose
         for box in frame.boxes:
-            if not np.isfinite([*box.centre, box.heading]).all():
-                raise LogError(f"{box.where}: the pose of {box.key!r} is not finite")
-            boxes.append(
-                FrameBox(
-                    key=box.key,
-                    category=_category(box),
-                    size=box.size,
-                    time_us=frame.time_us,
-                    T_world_object=to_world @ upright_pose(box.centre, box.heading),
-                    where=box.where,
+            with left_out.damaged("boxes"):
+                boxes.append(
+                    FrameBox(
+                        key=box.key,
+                        category=_category(box),
+                        size=box.size,
+                        time_us=frame.time_us,
+                        T_world_object=to_world @ upright_pose(box.centre, box.heading),
+                        where=box.where,
+                    )
                 )
-            )
     return boxes
 
 
@@ -406,16 +451,20 @@ def _category(box: WaymoBox) -> str:
     return "truck" if category == "car" and box.size[0] > TRUCK_LENGTH else category
 
 
-def _ego(frames: Sequence[WaymoFrame], to_first: Float, where: str) -> Trajectory:
+def _ego(
+    frames: Sequence[WaymoFrame], to_first: Float, left_out: LeftOut, where: str
+) -> Trajectory:
     poses = {frame.time_us: frame.pose for frame in frames}
     for frame in frames:
         for number, image in sorted(frame.images.items()):
-            place = f"{where}: pose of image {number} at {frame.start_us} us"
-            poses.setdefault(image.time_us, check_rigid(image.pose, place))
+            with left_out.damaged("poses"):
+                place = f"{where}: pose of image {number} at {frame.start_us} us"
+                poses.setdefault(image.time_us, check_rigid(image.pose, place))
     times = sorted(poses)
     return Trajectory.from_transforms(times, to_first @ np.array([poses[t] for t in times]))
 
 
 def _shutter(camera: WaymoCamera, frames: Sequence[WaymoFrame]) -> dict[str, Any]:
-    readouts = [f.images[camera.number].readout_us for f in frames]
-    return {"direction": camera.shutter, "readout_us": float(np.median(readouts))}
+    images = [f.images[camera.number] for f in frames if camera.number in f.images]
+    readout_us = float(np.median([image.readout_us for image in images]))
+    return {"direction": camera.shutter, "readout_us": readout_us}

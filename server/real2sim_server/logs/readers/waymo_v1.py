@@ -10,11 +10,11 @@ import struct
 import threading
 import zlib
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +22,9 @@ from numpy.typing import NDArray
 from ...geometry import Float
 from ..driving_log import DrivingLog, LidarSweep, LogError
 from ..images import check_encoded_image, decode_image
-from .common import select_sequence
+from .common import LeftOut, select_sequence
 from .waymo_common import (
+    MAX_TIME_S,
     TOP,
     Laser,
     RangeImage,
@@ -35,8 +36,8 @@ from .waymo_common import (
     build_waymo_log,
     merge_range_images,
     sweep_timings,
+    usable_frames,
     waymo_camera,
-    with_sweeps,
 )
 
 # --- TFRecord and protocol buffers ---------------------------------------------------------------
@@ -58,19 +59,27 @@ class Record:
     length: int
 
 
-def list_records(path: Path) -> list[Record]:
+def list_records(path: Path, left_out: LeftOut) -> list[Record]:
     """All records of a TFRecord file; headers are read and checked, payloads are skipped.
 
+    If a header is damaged, or the file is cut off, the rest of the file is left out.
+
     Raises:
-        LogError: the file is missing, empty, truncated, or a header's checksum is wrong.
+        LogError: the file cannot be read, or has no whole record.
     """
-    records = []
+    records: list[Record] = []
     try:
         size = path.stat().st_size
         with path.open("rb") as file:
             position = 0
             while position < size:
-                record = _record_at(path, file.read(_HEADER.size), position, size)
+                try:
+                    record = _record_at(path, file.read(_HEADER.size), position, size)
+                except LogError as error:
+                    if not records:
+                        raise
+                    left_out.add("ends of files", f"{error}; the rest is not read")
+                    break
                 records.append(record)
                 position = record.offset + record.length + 4
                 file.seek(position)
@@ -284,23 +293,35 @@ class WaymoV1Reader:
         """
         name = select_sequence(path, sorted(p.stem for p in path.glob(f"*{SUFFIX}")), sequence)
         file = path / f"{name}{SUFFIX}"
-        records = list_records(file)
-        read, first = [], None
-        for i, record in enumerate(records):
-            message = ProtoMessage(read_record(file, record), f"{file} frame {i}")
-            read.append(_read_frame(message))
-            first = first or message.message(1, "context")
+        left_out = LeftOut()
+        first, read = None, []
+        places: dict[int, Record] = {}
+        for i, record in enumerate(list_records(file, left_out)):
+            with left_out.damaged("frames"):
+                message = ProtoMessage(read_record(file, record), f"{file} frame {i}")
+                frame = _read_frame(message, left_out)
+                read.append(frame)
+                places.setdefault(frame.start_us, record)
+                first = first or message.message(1, "context")
+        frames = usable_frames(read, left_out, str(file))
         assert first is not None
-        kept, left_out = with_sweeps(read)
-        frames, records = [read[i] for i in kept], [records[i] for i in kept]
-        cameras = [_read_camera(m) for m in first.messages(2, "camera_calibrations")]
-        lasers = [_read_laser(m) for m in first.messages(3, "laser_calibrations")]
+        cameras = _by_number(
+            _read_camera, first.messages(2, "camera_calibrations"), left_out, "cameras"
+        )
+        lasers = _by_number(
+            _read_laser, first.messages(3, "laser_calibrations"), left_out, "LiDARs"
+        )
         source = _WaymoV1Source(
-            file, records, {c.name: c for c in cameras}, lasers, frames, sweep_timings(frames)
+            file,
+            [places[f.start_us] for f in frames],
+            {c.name: c for c in cameras},
+            lasers,
+            frames,
+            sweep_timings(frames),
         )
         return build_waymo_log(
             name=f"waymo_{first.text(1) or name}",
-            cameras=sorted(cameras, key=lambda c: c.number),
+            cameras=cameras,
             frames=frames,
             source=source,
             where=str(file),
@@ -311,6 +332,26 @@ class WaymoV1Reader:
             },
             left_out=left_out,
         )
+
+
+Calibrated = TypeVar("Calibrated", WaymoCamera, Laser)
+
+
+def _by_number(
+    read: Callable[[ProtoMessage], Calibrated],
+    messages: list[ProtoMessage],
+    left_out: LeftOut,
+    kind: str,
+) -> list[Calibrated]:
+    """The calibrations that can be read, in order of their sensors' numbers."""
+    found: dict[int, Calibrated] = {}
+    for message in messages:
+        with left_out.damaged(kind):
+            sensor = read(message)
+            if sensor.number in found:
+                raise LogError(f"{message.where}: sensor {sensor.number} is there twice")
+            found[sensor.number] = sensor
+    return [found[number] for number in sorted(found)]
 
 
 def _read_camera(message: ProtoMessage) -> WaymoCamera:
@@ -341,22 +382,30 @@ def _transform(message: ProtoMessage, number: int, name: str) -> Float:
     return values.reshape(4, 4)
 
 
-def _read_frame(message: ProtoMessage) -> WaymoFrame:
-    images = {}
+def _read_frame(message: ProtoMessage, left_out: LeftOut) -> WaymoFrame:
+    images: dict[int, WaymoImage] = {}
     for image in message.messages(4, "image"):
-        readout = image.number(8) - image.number(7) - image.number(6)
-        pose = _transform(image, 3, "pose")
-        images[image.integer(1)] = WaymoImage(round(image.number(5) * 1e6), pose, readout * 1e6)
+        with left_out.damaged("records"):
+            number, seconds = image.integer(1), image.number(5)
+            if number in images or not abs(seconds) < MAX_TIME_S:
+                raise LogError(f"{image.where}: image {number} is there twice, or has no time")
+            readout = image.number(8) - image.number(7) - image.number(6)
+            pose = _transform(image, 3, "pose")
+            images[number] = WaymoImage(round(seconds * 1e6), pose, readout * 1e6)
+    boxes, has_top = [], False
+    for label in message.messages(6, "laser_label"):
+        with left_out.damaged("boxes"):
+            boxes.append(_read_box(label))
+    for laser in message.messages(5, "laser"):
+        with left_out.damaged("records"):
+            returns = any(laser.message(i, "return").blob(2) for i in (2, 3))
+            has_top |= returns and laser.integer(1) == TOP
     return WaymoFrame(
         start_us=message.integer(2),
         pose=_transform(message, 3, "pose"),
         images=images,
-        boxes=[_read_box(m) for m in message.messages(6, "laser_label")],
-        lasers=frozenset(
-            laser.integer(1)
-            for laser in message.messages(5, "laser")
-            if any(laser.message(i, "return").blob(2) for i in (2, 3))
-        ),
+        boxes=boxes,
+        has_sweep=has_top,
     )
 
 
@@ -396,9 +445,8 @@ class _WaymoV1Source:
         lens = self.cameras[camera].lens
         check_encoded_image(data, where, (lens.width, lens.height))
 
-    def check_sweep(self, frame: int) -> int:
-        """Read the sweep: sweeps have no separate header."""
-        return len(self.lidar(frame).points)
+    def check_sweep(self, frame: int) -> None:
+        """Nothing to check: sweeps have no header of their own."""
 
     def lidar(self, frame: int) -> LidarSweep:
         images = _range_images(self._message(frame), self.lasers)
@@ -428,10 +476,8 @@ def _range_images(frame: ProtoMessage, lasers: Sequence[Laser]) -> list[RangeIma
         number, poses = message.integer(1), None
         for i in (2, 3):
             part = message.message(i, f"return {i - 1}")
-            if not part.blob(2):
+            if not part.blob(2) or number not in by_number:
                 continue
-            if number not in by_number:
-                raise LogError(f"{message.where}: laser {number} has no calibration")
             values = _matrix(part, 2, channels=2)
             if number == TOP and part.blob(4):
                 poses = _matrix(part, 4, channels=6)

@@ -6,7 +6,7 @@ Source: ``src/waymo_open_dataset/v2/perception`` of the data set's repository.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from ...geometry import Float
 from ..driving_log import DrivingLog, LidarSweep, LogError
 from ..images import check_encoded_image, decode_image
-from .common import select_sequence
+from .common import LeftOut, select_sequence
 from .files import ParquetFile
 from .waymo_common import (
-    CAMERA_NAMES,
+    MAX_TIME_S,
     TOP,
     Laser,
     RangeImage,
@@ -31,8 +31,8 @@ from .waymo_common import (
     build_waymo_log,
     merge_range_images,
     sweep_timings,
+    usable_frames,
     waymo_camera,
-    with_sweeps,
 )
 
 TIME = "key.frame_timestamp_micros"
@@ -76,12 +76,16 @@ class WaymoV2Reader:
         root = _split(path)
         known = sorted(p.stem for p in (root / "vehicle_pose").glob("*.parquet"))
         segment = select_sequence(root / "vehicle_pose", known, sequence)
-        files = _SegmentFiles(root, segment)
-        cameras = _read_cameras(files)
-        images, lidar = _read_images(files), _open_lidar(files)
-        read = _read_frames(files, images, _read_boxes(files), lidar)
-        kept, left_out = with_sweeps(read)
-        frames = [read[i] for i in kept]
+        files, left_out = _SegmentFiles(root, segment), LeftOut()
+        where = str(files.path("vehicle_pose"))
+        cameras = _read_cameras(files, left_out)
+        calibrated = {camera.number for camera in cameras}
+        images, lidar = _read_images(files, calibrated, left_out), _open_lidar(files, left_out)
+        frames = usable_frames(
+            _read_frames(files, images, _read_boxes(files, left_out), lidar, left_out),
+            left_out,
+            where,
+        )
         source = _WaymoV2Source(
             images=files.optional("camera_image"),
             rows={k: row for k, (row, _) in images.items()},
@@ -95,7 +99,7 @@ class WaymoV2Reader:
             cameras=cameras,
             frames=frames,
             source=source,
-            where=str(files.path("vehicle_pose")),
+            where=where,
             provenance={
                 "dataset": "Waymo Open Dataset v2",
                 "sequence": segment,
@@ -127,7 +131,7 @@ class _SegmentFiles:
         return self.open(component) if self.path(component).exists() else None
 
 
-def _read_cameras(files: _SegmentFiles) -> list[WaymoCamera]:
+def _read_cameras(files: _SegmentFiles, left_out: LeftOut) -> list[WaymoCamera]:
     file = files.optional("camera_calibration")
     if file is None:
         if files.path("camera_image").exists():
@@ -138,44 +142,57 @@ def _read_cameras(files: _SegmentFiles) -> list[WaymoCamera]:
     extrinsics = _transforms(file, f"{CALIBRATION}.extrinsic.transform")
     sizes = np.stack([file.numbers(f"{CALIBRATION}.{n}") for n in ("width", "height")], 1)
     shutters = file.numbers(f"{CALIBRATION}.rolling_shutter_direction")
-    return [
-        waymo_camera(
-            int(numbers[i]),
-            size=(int(sizes[i, 0]), int(sizes[i, 1])),
-            intrinsic=intrinsics[i].tolist(),
-            extrinsic=extrinsics[i],
-            shutter=int(shutters[i]),
-            where=str(file.path),
-        )
-        for i in np.argsort(numbers, kind="stable")
-    ]
+    cameras: dict[int, WaymoCamera] = {}
+    for i in range(len(file)):
+        with left_out.damaged("cameras"):
+            number = int(numbers[i])
+            if number in cameras:
+                raise LogError(f"{file.path} row {i}: camera {number} is there twice")
+            cameras[number] = waymo_camera(
+                number,
+                size=(int(sizes[i, 0]), int(sizes[i, 1])),
+                intrinsic=intrinsics[i].tolist(),
+                extrinsic=extrinsics[i],
+                shutter=int(shutters[i]),
+                where=str(file.path),
+            )
+    return [cameras[number] for number in sorted(cameras)]
 
 
 def _transforms(file: ParquetFile, name: str) -> Float:
+    """Matrices [N, 4, 4]; NaN where a cell does not hold 16 numbers."""
     values = file.numbers(name).astype(np.float64)
     if values.ndim != 2 or values.shape[1] != 16:
         raise LogError(f"{file.path}: {name!r} must hold 16 numbers each, not {values.shape[1:]}")
     return values.reshape(-1, 4, 4)
 
 
-def _read_images(files: _SegmentFiles) -> dict[tuple[int, int], tuple[int, WaymoImage]]:
+def _read_images(
+    files: _SegmentFiles, cameras: Container[int], left_out: LeftOut
+) -> dict[tuple[int, int], tuple[int, WaymoImage]]:
     """Row and pose of every image, by camera number and frame time stamp."""
     file = files.optional("camera_image")
     if file is None:
         return {}
-    file.require([f"{IMAGE}.image"])
+    names = [f"{IMAGE}.image", f"{IMAGE}.pose.transform", f"{IMAGE}.pose_timestamp"]
+    file.require(names)
     numbers, times = file.numbers(CAMERA), file.numbers(TIME)
     poses = _transforms(file, f"{IMAGE}.pose.transform")
     seconds = file.numbers(f"{IMAGE}.pose_timestamp")
     readout = _readout_seconds(file)
-    if not np.isfinite(seconds).all():
-        raise LogError(f"{file.path}: '{IMAGE}.pose_timestamp' holds a value that is not finite")
-    images = {}
-    for row, (number, time) in enumerate(zip(numbers.tolist(), times.tolist(), strict=True)):
-        if number not in CAMERA_NAMES or (number, time) in images:
-            raise LogError(f"{file.path} row {row}: camera {number} is unknown or twice at {time}")
-        image = WaymoImage(round(float(seconds[row]) * 1e6), poses[row], float(readout[row]) * 1e6)
-        images[number, time] = row, image
+    images: dict[tuple[int, int], tuple[int, WaymoImage]] = {}
+    for row in np.flatnonzero(file.complete([CAMERA, TIME], left_out)).tolist():
+        number, time, where = int(numbers[row]), int(times[row]), f"{file.path} row {row}"
+        with left_out.damaged("rows"):
+            if number not in cameras or (number, time) in images:
+                told = "has no calibration" if number not in cameras else f"is twice at {time} us"
+                raise LogError(f"{where}: camera {number} {told}")
+            if not abs(seconds[row]) < MAX_TIME_S:
+                raise LogError(f"{where}: the image has no time")
+            image = WaymoImage(
+                round(float(seconds[row]) * 1e6), poses[row], float(readout[row]) * 1e6
+            )
+            images[number, time] = row, image
     return images
 
 
@@ -191,19 +208,19 @@ def _readout_seconds(file: ParquetFile) -> Float:
     return seconds
 
 
-def _read_boxes(files: _SegmentFiles) -> dict[int, list[WaymoBox]]:
+def _read_boxes(files: _SegmentFiles, left_out: LeftOut) -> dict[int, list[WaymoBox]]:
     file = files.optional("lidar_box")
     boxes: dict[int, list[WaymoBox]] = defaultdict(list)
     if file is None:
         return boxes
     names = [f"{BOX}.box.{part}.{axis}" for part in ("center", "size") for axis in "xyz"]
     numbers = np.stack([file.numbers(n) for n in (*names, f"{BOX}.box.heading")], 1)
-    types, times = file.numbers(f"{BOX}.type"), file.numbers(TIME)
-    for row, key in enumerate(file.texts(OBJECT)):
+    types, times, keys = file.numbers(f"{BOX}.type"), file.numbers(TIME), file.texts(OBJECT)
+    for row in np.flatnonzero(file.complete([TIME, OBJECT, f"{BOX}.type"], left_out)).tolist():
         x, y, z, length, width, height, heading = numbers[row].astype(np.float64).tolist()
         boxes[int(times[row])].append(
             WaymoBox(
-                key=key,
+                key=keys[row],
                 type=int(types[row]),
                 centre=(x, y, z),
                 size=(length, width, height),
@@ -219,23 +236,30 @@ def _read_frames(
     images: Mapping[tuple[int, int], tuple[int, WaymoImage]],
     boxes: Mapping[int, list[WaymoBox]],
     lidar: _Lidar | None,
+    left_out: LeftOut,
 ) -> list[WaymoFrame]:
     file = files.open("vehicle_pose")
-    times, poses = file.numbers(TIME).tolist(), _transforms(file, POSE)
-    if len(times) == 0:
-        raise LogError(f"{file.path}: holds no poses")
-    unmatched = ({t for _, t in images} | set(boxes)) - set(times)
-    if unmatched:
-        raise LogError(f"{file.path}: has no pose for the frame of {min(unmatched)} us")
+    times, poses = file.numbers(TIME), _transforms(file, POSE)
+    good = np.flatnonzero(file.complete([TIME], left_out)).tolist()
+    posed = {int(times[row]) for row in good}
+    for time in sorted({t for _, t in images} - posed):
+        left_out.add("frames", f"{file.path}: has no pose for the frame of {time} us")
+    for time in sorted(set(boxes) - posed):
+        for box in boxes[time]:
+            left_out.add("boxes", f"{box.where}: its frame of {time} us has no pose")
     by_time: dict[int, dict[int, WaymoImage]] = defaultdict(dict)
     for (number, time), (_, image) in images.items():
         by_time[time][number] = image
-    lasers: dict[int, set[int]] = defaultdict(set)
-    for number, time in lidar.rows if lidar is not None else ():
-        lasers[time].add(number)
+    tops = {time for number, time in lidar.rows if number == TOP} if lidar is not None else set()
     return [
-        WaymoFrame(time, pose, by_time.get(time, {}), boxes.get(time, ()), frozenset(lasers[time]))
-        for time, pose in zip(times, poses, strict=True)
+        WaymoFrame(
+            int(times[row]),
+            poses[row],
+            by_time.get(int(times[row]), {}),
+            boxes.get(int(times[row]), ()),
+            int(times[row]) in tops,
+        )
+        for row in good
     ]
 
 
@@ -250,7 +274,7 @@ class _Lidar:
     pose_rows: Mapping[tuple[int, int], int]
 
 
-def _open_lidar(files: _SegmentFiles) -> _Lidar | None:
+def _open_lidar(files: _SegmentFiles, left_out: LeftOut) -> _Lidar | None:
     ranges = files.optional("lidar")
     if ranges is None:
         return None
@@ -261,34 +285,46 @@ def _open_lidar(files: _SegmentFiles) -> _Lidar | None:
         poses.require([f"{LIDAR_POSE}.values", f"{LIDAR_POSE}.shape"])
     shapes = [ranges.lists(f"{LIDAR}.range_image_return{i}.shape") for i in (1, 2)]
     seen = [any(s and 0 not in s for s in both) for both in zip(*shapes, strict=True)]
-    rows = {key: row for key, row in _rows(ranges).items() if seen[row]}
-    lasers = _read_lasers(files.open("lidar_calibration"))
-    for number, _ in rows:
-        if number not in lasers:
-            raise LogError(f"{files.path('lidar_calibration')}: has no laser {number}")
-    return _Lidar(ranges, poses, lasers, rows, _rows(poses) if poses is not None else {})
+    rows = {key: row for key, row in _rows(ranges, left_out).items() if seen[row]}
+    lasers = _read_lasers(files.open("lidar_calibration"), left_out)
+    for number in sorted({number for number, _ in rows} - set(lasers)):
+        told = f"has no usable laser {number}"
+        left_out.add("LiDARs", f"{files.path('lidar_calibration')}: {told}")
+    rows = {key: row for key, row in rows.items() if key[0] in lasers}
+    return _Lidar(ranges, poses, lasers, rows, _rows(poses, left_out) if poses is not None else {})
 
 
-def _rows(file: ParquetFile) -> dict[tuple[int, int], int]:
-    keys = zip(file.numbers(LASER).tolist(), file.numbers(TIME).tolist(), strict=True)
-    return {key: row for row, key in enumerate(keys)}
+def _rows(file: ParquetFile, left_out: LeftOut) -> dict[tuple[int, int], int]:
+    numbers, times = file.numbers(LASER), file.numbers(TIME)
+    found: dict[tuple[int, int], int] = {}
+    for row in np.flatnonzero(file.complete([LASER, TIME], left_out)).tolist():
+        key = int(numbers[row]), int(times[row])
+        if key in found:
+            left_out.add("rows", f"{file.path} row {row}: laser {key[0]} is twice at {key[1]} us")
+        else:
+            found[key] = row
+    return found
 
 
-def _read_lasers(file: ParquetFile) -> dict[int, Laser]:
+def _read_lasers(file: ParquetFile, left_out: LeftOut) -> dict[int, Laser]:
     numbers = file.numbers(LASER)
     extrinsics = _transforms(file, f"{LIDAR_CALIBRATION}.extrinsic.transform")
     prefix = f"{LIDAR_CALIBRATION}.beam_inclination"
     low, high = file.numbers(f"{prefix}.min"), file.numbers(f"{prefix}.max")
     beams = file.lists(f"{prefix}.values")
-    return {
-        int(number): Laser(
-            int(number),
-            np.array(beams[i], dtype=np.float64) if beams[i] else None,
-            (float(low[i]), float(high[i])),
-            extrinsics[i],
-        )
-        for i, number in enumerate(numbers)
-    }
+    lasers: dict[int, Laser] = {}
+    for i in np.flatnonzero(file.complete([LASER], left_out)).tolist():
+        number, where = int(numbers[i]), f"{file.path} row {i}"
+        with left_out.damaged("rows"):
+            if number in lasers:
+                raise LogError(f"{where}: laser {number} is there twice")
+            lasers[number] = Laser(
+                number,
+                np.array(beams[i], dtype=np.float64) if beams[i] else None,
+                (float(low[i]), float(high[i])),
+                extrinsics[i],
+            )
+    return lasers
 
 
 @dataclass(frozen=True, eq=False)
@@ -311,9 +347,8 @@ class _WaymoV2Source:
         lens = self.cameras[camera].lens
         check_encoded_image(data, where, (lens.width, lens.height))
 
-    def check_sweep(self, frame: int) -> int:
-        """Read the sweep: sweeps have no separate header."""
-        return len(self.lidar(frame).points)
+    def check_sweep(self, frame: int) -> None:
+        """Nothing to check: sweeps have no header of their own."""
 
     def lidar(self, frame: int) -> LidarSweep:
         files, here = self.lidar_files, self.frames[frame]

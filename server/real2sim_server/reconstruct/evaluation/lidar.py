@@ -182,6 +182,7 @@ def evaluate_views(
         _coverage_score(scene, log, log.rig[name], frame, width=width, backend=backend)
         for frame in frames
         for name in names
+        if log.has_image(name, frame)
     )
     return CoverageReport(
         views=views,

@@ -203,12 +203,7 @@ def select_cameras(scene: Scene, log: DrivingLog, width: int | None) -> tuple[Ca
             f"scene {scene.name!r} has cameras {list(scene.rig.names)} and lacks {missing} of log "
             f"{log.name!r}; evaluate it on the log it was made of"
         )
-    without = set(log.provenance.get("cameras_without_images", ()))
-    return tuple(
-        scene.rig[camera.name].resized(width or camera.width)
-        for camera in log.rig
-        if camera.name not in without
-    )
+    return tuple(scene.rig[camera.name].resized(width or camera.width) for camera in log.rig)
 
 
 def listed_held_out(scene: Scene) -> list[int]:

@@ -223,7 +223,14 @@ def evaluate_scene(
     stages = Stages(on_progress, timing_s)
     chosen = select_frames(scene, log, options.frames)
     cameras = select_cameras(scene, log, options.width)
-    pairs = [(camera, frame) for frame in chosen.frames for camera in cameras]
+    pairs = [
+        (camera, frame)
+        for frame in chosen.frames
+        for camera in cameras
+        if log.has_image(camera.name, frame)
+    ]
+    if not pairs:
+        raise ReconstructError(f"log {log.name!r} has no image at frames {list(chosen.frames)}")
     views, errors = [], []
     with stages("views") as report_step:
         for done, (camera, frame) in enumerate(pairs):

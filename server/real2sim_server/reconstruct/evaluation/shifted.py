@@ -236,6 +236,8 @@ def _score_of_images(
 ) -> float:
     scores = []
     for frame in frames:
+        if not log.has_image(camera.name, frame):
+            continue
         place, colours = projected_road(road, log, camera, image_time(log, camera.name, frame), 0.0)
         if len(place) >= MIN_PIXELS:
             scores.append(_psnr(resized(log.image(camera.name, frame), camera), place, colours))
@@ -277,7 +279,8 @@ def road_colours(log: DrivingLog, camera: Camera, ground: Ground) -> RoadColours
     """The road as seen at close range in the images of ``camera``, outside all boxes."""
     near, far = COLOURED_WITHIN
     points, colours = [np.zeros((0, 3))], [np.zeros((0, 3), np.float32)]
-    for frame in range(0, log.frame_count, -(-log.frame_count // MAX_FRAMES)):
+    seen = [frame for frame in range(log.frame_count) if log.has_image(camera.name, frame)]
+    for frame in seen[:: max(1, -(-len(seen) // MAX_FRAMES))]:
         t_us = image_time(log, camera.name, frame)
         row, column, depth = seen_points(points_in_camera(log, camera, frame, t_us), camera)
         pose = camera.pose(log.ego.transform(t_us))

@@ -142,7 +142,9 @@ def _views(scene: Scene, log: DrivingLog, count: int) -> list[tuple[Camera, int]
         frames = [
             frame
             for frame in range(log.frame_count)
-            if frame not in held_out and scene.ego.covers(image_time(log, camera.name, frame))
+            if frame not in held_out
+            and log.has_image(camera.name, frame)
+            and scene.ego.covers(image_time(log, camera.name, frame))
         ]
         own = min(len(frames), count // len(cameras) + (place < count % len(cameras)))
         shift = (place + 0.5) / len(cameras)

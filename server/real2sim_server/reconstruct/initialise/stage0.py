@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ...geometry import Float
 from ...logs import DrivingLog, ObjectTrack
+from ...logs.driving_log import NAMED
 from ...maps import laid_on, lanes_of_log
 from ...scene import GaussianCloud, Ground, Scene, SceneObject, Sky
 from ...scene.cloud import SH_C0
@@ -455,9 +456,18 @@ def _assemble(
         ego_size=log.ego_size,
         provenance={
             **log.provenance,
+            **({"left_out": _left_out(log)} if log.left_out else {}),
             "reconstruction": {"stage": 0, "iterations": 0, **made},
         },
     )
+
+
+def _left_out(log: DrivingLog) -> dict[str, Any]:
+    """For each kind of record that the log does not use, the number and the first reasons."""
+    return {
+        kind: {"count": len(sentences), "first": list(sentences[:NAMED])}
+        for kind, sentences in log.left_out.items()
+    }
 
 
 def _cloud(

@@ -115,6 +115,8 @@ def spread_frames(log: DrivingLog, camera: Camera, limit: int) -> list[int]:
     if limit == 0:
         return []
     for frame in range(log.frame_count):
+        if not log.has_image(camera.name, frame):
+            continue
         centre = _pose(log, camera, frame)[:3, 3]
         if last is None or np.linalg.norm(centre - last) >= MIN_STEP:
             kept.append(frame)

@@ -194,7 +194,7 @@ def faced(
     for frame, camera in itertools.product(frames, log.rig):
         t_us = log.image_time_us(camera.name, frame)
         pose = track.transform_near(t_us)
-        if pose is None or found.all():
+        if pose is None or found.all() or not log.has_image(camera.name, frame):
             continue
         t_us = min(max(t_us, log.ego.start_us), log.ego.end_us)
         to_camera = camera.viewmat(log.ego.transform(t_us)) @ pose

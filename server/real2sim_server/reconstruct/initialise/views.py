@@ -68,9 +68,9 @@ class ProjectedView:
 
 
 def chosen_frames(log: DrivingLog, limit: int) -> list[int]:
-    """At most ``limit`` frames, evenly spread, including the first and the last."""
-    count = min(limit, log.frame_count)
-    return sorted({round(i) for i in np.linspace(0, log.frame_count - 1, count)})
+    """At most ``limit`` frames with images, evenly spread, including the first and the last."""
+    seen = log.seen_frames()
+    return [seen[round(i)] for i in np.linspace(0, len(seen) - 1, min(limit, len(seen)))]
 
 
 class ColourSamples:
@@ -234,7 +234,7 @@ def gather_views(
 
 def _images(log: DrivingLog, frames: list[int]) -> Iterator[tuple[Camera, int, NDArray[np.uint8]]]:
     """All images in order, prefetched by one."""
-    wanted = [(camera, frame) for frame in frames for camera in log.rig]
+    wanted = [(c, frame) for frame in frames for c in log.rig if log.has_image(c.name, frame)]
     with ThreadPoolExecutor(1) as reader:
         ahead = [reader.submit(log.image, c.name, f) for c, f in wanted[:1]]
         for index, (camera, frame) in enumerate(wanted):

@@ -103,12 +103,15 @@ class TrainingViews:
         *,
         device: torch.device | str = "cpu",
     ) -> None:
-        if not frames or len(log.rig) == 0:
-            raise ReconstructError(f"log {log.name!r} has no image to train on")
         self._log, self._options = log, options
-        without = set(log.provenance.get("cameras_without_images", ()))
-        names = [name for name in log.rig.names if name not in without]
-        self._keys = [(name, frame) for frame in frames for name in names]
+        self._keys = [
+            (name, frame)
+            for frame in frames
+            for name in log.rig.names
+            if log.has_image(name, frame)
+        ]
+        if not self._keys:
+            raise ReconstructError(f"log {log.name!r} has no image to train on")
         self._cache: OrderedDict[int, _CachedImage] = OrderedDict()
         self._nbytes = 0
         self._device = torch.device(device)

@@ -21,7 +21,7 @@ from ...geometry import (
     quaternion_yaw,
     yaw_quaternion,
 )
-from ...logs import DrivingLog, ObjectTrack, check_log
+from ...logs import DrivingLog, ObjectTrack
 from ...logs.driving_log import SELECTION
 from ...render.backend import Backend
 from ...render.images import write_png
@@ -171,7 +171,8 @@ def score_held_out(
     Raises:
         LogError: an image cannot be read.
     """
-    frames = held_out_frames(log.frame_count, options.hold_out)
+    held_out = set(held_out_frames(log.frame_count, options.hold_out))
+    frames = [frame for frame in log.seen_frames() if frame in held_out]
     if limit is not None and len(frames) > limit:
         frames = [frames[i] for i in np.linspace(0, len(frames) - 1, limit).round().astype(int)]
     if not frames:
@@ -256,12 +257,10 @@ def train(
 
     Raises:
         ReconstructError: the log has nothing to train on, or there is nothing to resume.
-        LogError: a file of the log is missing or broken; raised before anything is built.
+        LogError: an image or a sweep cannot be read; :func:`usable_log` leaves such ones out.
     """
     timing_s = {} if timing_s is None else timing_s
     stages = Stages(on_progress, timing_s)
-    with stages("check") as report_step:
-        check_log(log, on_progress=report_step).raise_for_problems()
     scene = _first_scene(
         log, options, folder, resume=resume, on_progress=on_progress, timing_s=timing_s
     )
@@ -348,7 +347,9 @@ def _previewer(
     log: DrivingLog, options: TrainOptions, folder: Path
 ) -> Callable[[SceneModel, int], None]:
     """Writes the image of a held-out frame above the rendering of the model, camera by camera."""
-    frames = held_out_frames(log.frame_count, options.hold_out) or [log.frame_count // 2]
+    seen = log.seen_frames()
+    held_out = set(held_out_frames(log.frame_count, options.hold_out))
+    frames = [frame for frame in seen if frame in held_out] or seen
     views = TrainingViews(log, [frames[len(frames) // 2]], options)
 
     def write(model: SceneModel, iteration: int) -> None:

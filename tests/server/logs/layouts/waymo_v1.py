@@ -25,7 +25,10 @@ FAR_AWAY = np.array([-25211.2589, 42391.0813, -160.618])
 
 
 def write(log: DrivingLog, path: Path) -> None:
-    payloads = [_frame(log, frame) for frame in range(log.frame_count)]
+    write_payloads([_frame(log, frame) for frame in range(log.frame_count)], path)
+
+
+def write_payloads(payloads: list[bytes], path: Path) -> None:
     with path.open("wb") as file:
         for payload in payloads:
             length = struct.pack("<Q", len(payload))
