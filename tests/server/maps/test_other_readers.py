@@ -172,6 +172,26 @@ def test_comments_may_precede_the_xml_declaration(tmp_path, name, before, encodi
 
 
 @pytest.mark.parametrize("name", ["opendrive", "lanelet2"])
+def test_a_document_type_is_refused_in_any_encoding(tmp_path, name):
+    """Without its byte order mark, UTF-16 is still XML."""
+    path = globals()[f"written_{name}"](tmp_path)
+    text = (
+        f"<?xml version='1.0' encoding='utf-16'?><!DOCTYPE a [<!ENTITY b 'c'>]>{path.read_text()}"
+    )
+    path.write_bytes(text.encode("utf-16-le"))
+    with pytest.raises(MapError, match="document type"):
+        read_map(path)
+
+
+@pytest.mark.parametrize("name", ["opendrive", "lanelet2"])
+def test_suffixes_may_be_upper_case(tmp_path, name):
+    path = globals()[f"written_{name}"](tmp_path)
+    path = path.rename(path.with_suffix(path.suffix.upper()))
+    path.write_text("<!--" + " " * 5000 + "-->" + path.read_text())
+    assert read_map(path).lanes
+
+
+@pytest.mark.parametrize("name", ["opendrive", "lanelet2"])
 @pytest.mark.parametrize("prefix", ["", "m:"])
 def test_xml_namespaces_are_ignored(tmp_path, name, prefix):
     """Elements of another namespace are not read as parts of the map."""
