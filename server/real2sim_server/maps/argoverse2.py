@@ -60,15 +60,24 @@ def _graph(content: dict[str, Any], file: Path) -> LaneGraph:
         raise MapError(f"{file}: has no lane segments")
     check_rest(str(file), "lane segments", lanes, segments, left_out)
     areas: list[Area] = []
-    for key, entry in content.get("drivable_areas", {}).items():
+    for key, entry in _table(content, "drivable_areas", left_out).items():
         with LeavingOut(left_out["drivable areas left out because they cannot be read"], str(key)):
             areas.append(Area(str(entry["id"]), "drivable", _points(entry["area_boundary"])))
-    for key, entry in content.get("pedestrian_crossings", {}).items():
+    for key, entry in _table(content, "pedestrian_crossings", left_out).items():
         with LeavingOut(left_out["crossings left out because they cannot be read"], str(key)):
             one, other = (_points(entry[edge]) for edge in ("edge1", "edge2"))
             outline = np.concatenate([one, other[::-1]])
             areas.append(Area(f"crossing_{entry['id']}", "crosswalk", outline))
     return joined(lanes, left_out, areas=areas, source=f"argoverse2 {file.name}")
+
+
+def _table(content: dict[str, Any], name: str, left_out: LeftOut) -> dict[str, Any]:
+    """Entries by their key; empty if the file lacks the table."""
+    found: Any = content.get(name, {})
+    if isinstance(found, dict):
+        return found
+    left_out["tables left out because they are not objects"].append(name)
+    return {}
 
 
 def _archive(path: Path) -> Path | None:

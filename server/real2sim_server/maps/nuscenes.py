@@ -98,8 +98,11 @@ class _Tables:
 
     def rows(self, name: str) -> list[dict[str, Any]]:
         """Rows of a table; empty if the file lacks the table."""
-        found: list[dict[str, Any]] = self.content.get(name, [])
-        return found
+        found: Any = self.content.get(name, [])
+        if isinstance(found, list):
+            return found
+        self.left_out["tables left out because they are not lists"].append(name)
+        return []
 
     def lanes(self) -> list[Lane]:
         found = []
@@ -128,9 +131,7 @@ class _Tables:
         length = float(np.linalg.norm(np.diff(line[:, :2], axis=0), axis=1).sum())
         ring = self.rings.get(row.get("polygon_token", ""), np.zeros((0, 3)))
         if len(ring) < 3:
-            # Lane connectors have no polygons.
-            if "polygon_token" in row:
-                self.left_out["lanes of 3.5 m, because they have no polygon"].append(token)
+            self.left_out["lanes of 3.5 m, because they have no polygon"].append(token)
             return USUAL_WIDTH_M
         width = _area_of(ring) / length
         if not WIDTHS_M[0] <= width <= WIDTHS_M[1]:

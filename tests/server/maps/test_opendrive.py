@@ -432,3 +432,35 @@ def test_gaps_of_profiles_and_geometries_are_noted(tmp_path):
         "roads with gaps or overlaps between their geometries: 1 (1)",
         "roads whose elevation begins later than they do, 0 before: 1 (1)",
     )
+
+
+def test_removing_any_element_leaves_the_other_roads_as_they_are(tmp_path):
+    """What is read and what the notes count adds up to the roads of the file."""
+    links = (
+        '<link><predecessor elementType="road" elementId="{}" contactPoint="end"/>'
+        '<successor elementType="road" elementId="{}" contactPoint="start"/></link>'
+    )
+    onward = lane(-1, links='<predecessor id="-1"/><successor id="-1"/>') + lane(-2)
+    roads = [
+        road(k, more=links.format((k - 2) % 5 + 1, k % 5 + 1), sections=section(0, right=onward))
+        for k in range(1, 6)
+    ]
+    whole = read_roads(tmp_path, *roads)
+    text = f"<OpenDRIVE>{''.join(roads)}</OpenDRIVE>"
+    paths = [(p, c) for p, e in enumerate(ET.fromstring(text).iter()) for c in range(len(e))]
+    for parent, child in paths:
+        root = ET.fromstring(text)
+        holder = list(root.iter())[parent]
+        element = holder[child]
+        own = next(r.get("id") for r in root if element in r.iter())
+        holder.remove(element)
+        graph = read_roads(tmp_path, *(ET.tostring(r, "unicode") for r in root))
+        kept = {key: lane for key, lane in whole.lanes.items() if not key.startswith(f"{own}.")}
+        for key, before in kept.items():
+            assert np.array_equal(graph.lane(key).centre, before.centre)
+            assert np.array_equal(graph.lane(key).widths, before.widths)
+        told = "; ".join(graph.notes)
+        lost = re.search(r"roads left out because they cannot be read: (\d+)", told)
+        assert len(graph.roads) + int(lost[1] if lost else 0) == len(root)
+        if element.tag == "road" or lost:
+            assert "links of roads to a road or junction that is not there: 2" in told

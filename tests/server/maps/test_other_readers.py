@@ -486,6 +486,8 @@ def change(content, place, value):
         ("argoverse2", "lane_segments 10 left_neighbor_id", 77, "not in the file: .*10 to 77"),
         ("argoverse2", "drivable_areas 7 area_boundary", None, "areas .*7: lacks 'area_boundary'"),
         ("argoverse2", "pedestrian_crossings 8 edge1", "x", "crossings .*8: TypeError"),
+        ("argoverse2", "drivable_areas", [], "not objects: 1 .drivable_areas"),
+        ("nuscenes", "stop_line", {}, "not lists: 1 .stop_line"),
         ("nuscenes", "lane 1 polygon_token", "gone", r"3.5 m, because they have no .*\(l0\)"),
         ("nuscenes", "arcline_path_3 l0 0 radius", "x", "lanes left out .*l0: ValueError"),
         ("nuscenes", "arcline_path_3 l0", [], "lanes left out .*l0: has no arcline_path_3"),
