@@ -143,8 +143,10 @@ def _through(
             continue
         leaves = _facing_end(roads[incoming], roads[crossing], contact, name)
         for link in connection.findall("laneLink"):
-            a, b = (integer(link, n) for n in ("from", "to"))
-            yield _end_of(roads[incoming], leaves, a), _end_of(roads[crossing], contact, b)
+            told = left_out["lane links of junctions left out because they cannot be read"]
+            with LeavingOut(told, f"{connection.get('id', '')} of {name}"):
+                a, b = (integer(link, n) for n in ("from", "to"))
+                yield _end_of(roads[incoming], leaves, a), _end_of(roads[crossing], contact, b)
 
 
 def _facing_end(

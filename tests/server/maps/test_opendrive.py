@@ -391,6 +391,31 @@ def test_a_damaged_part_costs_nothing_else(tmp_path, damaged, lost, note):
     assert (note is None and not graph.notes) or any(re.search(note, n) for n in graph.notes)
 
 
+@pytest.mark.parametrize(
+    ("connection", "note"),
+    [
+        ('<laneLink from="x" to="-1"/>', "lane links of junctions .*0 of 9: from of <laneLink>"),
+        ('<laneLink from="-7" to="-1"/>', r"lane links to a lane that is not there: 1 \(1.0.-7\)"),
+        ('contact="middle"', "because of their contact point: 1 .0 of 9: 'middle'"),
+        ("no road", r"because they lack a road: 1 \(0 of 9\)"),
+    ],
+)
+def test_a_damaged_connection_costs_no_other(tmp_path, connection, note):
+    link = '<laneLink from="-2" to="-2"/>'
+    given = 'incomingRoad="1" ' * (connection != "no road") + 'connectingRoad="2" contactPoint='
+    damaged = f'<connection id="0" {given}"start">{connection}</connection>'
+    if connection.startswith("contact"):
+        damaged = f'<connection id="0" {given}"middle">{link}</connection>'
+    if connection == "no road":
+        damaged = damaged.replace(connection, link)
+    sound = f'<connection id="1" incomingRoad="1" connectingRoad="2" contactPoint="start">{link}'
+    into = '<link><successor elementType="junction" elementId="9"/></link>'
+    junction = f'<junction id="9">{damaged}{sound}</connection></junction>'
+    graph = read_roads(tmp_path, road(1, more=into), road(2, attributes=""), junction)
+    assert graph.lane("1.0.-2").successors == ("2.0.-2",)
+    assert [n for n in graph.notes if re.search(note, n)] == list(graph.notes)
+
+
 def test_all_damage_of_a_file_is_told_at_once(tmp_path):
     other = road(2).replace('hdg="0"', 'hdg="nan"')
     graph = read_roads(tmp_path, road(1), other, road(3, more=SIGN.format("<signal/>")))
