@@ -10,10 +10,12 @@ import secrets
 import shutil
 import tarfile
 import time
+import xml.etree.ElementTree as ET
+import xml.parsers.expat
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 _TEMPORARY = re.compile(r"\.(?P<name>.+)\.(?P<purpose>tmp|old)-[0-9a-f]{12}")
 """Names made by :func:`_sibling`."""
@@ -32,6 +34,73 @@ def read_text(path: Path) -> str:
     utf16 = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     text = data.decode("utf-16" if utf16 else "utf-8-sig")
     return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+MAX_XML_BYTES = 512 << 20
+_DECLARATION = re.compile(r"<\?xml\s.*?\?>", re.DOTALL)
+_BEFORE_DECLARATION = re.compile(
+    rb"(?:\xef\xbb\xbf)?((?>\s+|<!--.*?-->)++)(<\?xml\s.*?\?>)", re.DOTALL
+)
+
+
+def read_xml(path: Path) -> ET.Element:
+    """The root element of an XML file; names of its namespace are plain names.
+
+    Accepts what :func:`xml_data` accepts. Elements of other namespaces keep theirs.
+
+    Raises:
+        OSError: it cannot be read.
+        ValueError: it is larger than 512 MiB, not XML, or declares a document type.
+    """
+    if path.stat().st_size > MAX_XML_BYTES:
+        raise ValueError(f"is larger than {MAX_XML_BYTES >> 20} MiB, the most that is read")
+    try:
+        root = ET.fromstring(xml_data(path.read_bytes()))
+    except (ET.ParseError, xml.parsers.expat.ExpatError, LookupError) as error:
+        # A LookupError comes from an encoding that Python does not have.
+        raise ValueError(f"is not an XML file ({error})") from error
+    namespace, brace, _ = root.tag.rpartition("}")
+    if brace:
+        for element in root.iter():
+            element.tag = element.tag.removeprefix(namespace + brace)
+    return root
+
+
+def xml_data(data: bytes) -> bytes:
+    """The content of an XML file as parsers accept it; lines keep their numbers.
+
+    Accepts a byte order mark, UTF-16 with any declared encoding, and white space or comments before
+    the declaration.
+
+    Raises:
+        ValueError: it declares a document type. Its entities could expand a small file until it
+            fills the memory.
+        xml.parsers.expat.ExpatError, LookupError: its beginning is not XML.
+    """
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        data = _DECLARATION.sub("", data.decode("utf-16", "replace"), count=1).encode()
+    if before := _BEFORE_DECLARATION.match(data):
+        data = before[2] + before[1] + data[before.end() :]
+    _check_prolog(data)
+    return data
+
+
+class _RootReached(Exception):
+    """The first element begins, so that no document type follows."""
+
+
+def _check_prolog(data: bytes) -> None:
+    def refuse(*_: Any) -> None:
+        raise ValueError("declares a document type or entities, which are not read")
+
+    def end(*_: Any) -> None:
+        raise _RootReached
+
+    parser = xml.parsers.expat.ParserCreate()
+    parser.StartDoctypeDeclHandler = parser.EntityDeclHandler = refuse
+    parser.StartElementHandler = end
+    with suppress(_RootReached):
+        parser.Parse(data, True)
 
 
 @contextmanager

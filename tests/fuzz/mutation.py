@@ -1,4 +1,4 @@
-"""Mutations of bytes, JSON values and msgpack values."""
+"""Mutations of bytes, JSON values, XML elements and msgpack values."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import json
 import random
 import re
 import struct
+import xml.etree.ElementTree as ET
 from collections.abc import Callable
 from typing import Any
 
@@ -19,6 +20,7 @@ VALUES: tuple[Any, ...] = (
     None, True, False, 0, -1, 1, 2**31, 2**53, -(2**63), 2**64 - 1, 1e308, -1e-308, "", "x",
     "\x00", "../../x", "9" * 400, [], {}, [[]], [None], {"a": None}, [[0.0] * 3], "NaN",
 )  # fmt: skip
+TEXTS = ("nan", "inf", "-1", "0", "1e308", "99999999999", "x", "", "1.5")
 FLOATS = (float("nan"), float("inf"), -float("inf"), 0.0, -0.0, 3.4e38, 1e-45, -1.0)
 
 
@@ -102,6 +104,34 @@ def damaged_json(data: bytes, rng: random.Random) -> bytes:
     for _ in range(rng.choice((1, 1, 3))):
         tree = _damaged_tree(tree, rng, lambda: rng.choice((*VALUES, *FLOATS)))
     return json.dumps(tree).encode()
+
+
+def damaged_xml(data: bytes, rng: random.Random) -> bytes:
+    """An XML text with one to three elements or attributes removed, doubled or changed. Returns the
+    input if it is not XML.
+    """
+    try:
+        root = ET.fromstring(data)
+    except (ET.ParseError, ValueError, LookupError):
+        return data
+    for _ in range(rng.choice((1, 1, 3))):
+        parents = [element for element in root.iter() if len(element)]
+        named = [element for element in root.iter() if element.attrib]
+        injury = rng.random()
+        if injury < 0.3 and parents:
+            parent = rng.choice(parents)
+            parent.remove(rng.choice(list(parent)))
+        elif injury < 0.4 and parents:
+            parent = rng.choice(parents)
+            parent.append(rng.choice(list(parent)))
+        elif named:
+            element = rng.choice(named)
+            name = rng.choice(sorted(element.attrib))
+            if injury < 0.6:
+                del element.attrib[name]
+            else:
+                element.set(name, rng.choice(TEXTS))
+    return ET.tostring(root)
 
 
 def damaged_msgpack(data: bytes, rng: random.Random) -> bytes:

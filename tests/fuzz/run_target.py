@@ -111,8 +111,11 @@ def damaged(parts: readers.Parts, samples: list, rng: random.Random) -> readers.
     if kind < 0.04:
         parts[name] = parts[rng.choice(sorted(parts))]
         return parts
-    if name.endswith(".json") and kind < 0.8:
+    is_json = name.endswith(".json") or parts[name].startswith(b"{")
+    if is_json and kind < 0.8:
         parts[name] = mutation.damaged_json(parts[name], rng)
+    elif parts[name].startswith(b"<") and kind < 0.6:
+        parts[name] = mutation.damaged_xml(parts[name], rng)
     elif name.endswith(".msgpack") and kind < 0.8:
         parts[name] = mutation.damaged_msgpack(parts[name], rng)
     else:

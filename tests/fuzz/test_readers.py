@@ -7,7 +7,9 @@ runs.
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
+import random
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -50,13 +52,32 @@ def test_damaged_input_is_refused(name, pytestconfig):
     check.check_target(name, pytestconfig)
 
 
-def test_the_same_seed_gives_the_same_inputs():
-    sys.path.insert(0, str(FOLDER))
-    try:
-        import random
+@pytest.fixture
+def fuzzer(monkeypatch):
+    """The modules of the fuzzer, which import each other by name."""
+    monkeypatch.syspath_prepend(str(FOLDER))
+    names = ("mutation", "readers", "run_target")
+    yield SimpleNamespace(**{name: importlib.import_module(name) for name in names})
+    for name in names:
+        sys.modules.pop(name, None)
 
-        mutation = _module("mutation")
-        runs = [mutation.damaged_bytes(b"0123456789" * 50, [], random.Random(7)) for _ in range(2)]
-    finally:
-        sys.path.remove(str(FOLDER))
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("name", [n for n in NAMES if n.startswith(("map_", "openscenario"))])
+def test_sixty_damaged_maps_and_scenarios_are_read_or_refused(fuzzer, tmp_path, name):
+    target = fuzzer.readers.target(name, None)
+    samples = target.sample(tmp_path)
+    read = 0
+    for number in range(60):
+        rng = random.Random(f"{name} {number}")
+        parts = fuzzer.run_target.damaged(rng.choice(samples), samples, rng)
+        with contextlib.suppress(*target.errors):
+            target.read(target.write(parts, tmp_path))
+            read += 1
+    assert read
+
+
+def test_the_same_seed_gives_the_same_inputs(fuzzer):
+    data = b"0123456789" * 50
+    runs = [fuzzer.mutation.damaged_bytes(data, [], random.Random(7)) for _ in range(2)]
     assert runs[0] == runs[1] != b"0123456789" * 50

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,16 @@ from real2sim_proto.lanes import LaneKind
 
 from ..geometry import Float
 from ..scene import Area, Lane, LaneGraph
-from .reader import MapError, between, damage_named, joined, read_json
+from .reader import (
+    LeavingOut,
+    LeftOut,
+    MapError,
+    between,
+    check_rest,
+    damage_named,
+    joined,
+    read_json,
+)
 
 PATTERN = "log_map_archive_*.json"
 KINDS: dict[str, LaneKind] = {"VEHICLE": "driving", "BUS": "bus", "BIKE": "bicycle"}
@@ -36,23 +46,38 @@ class Argoverse2MapReader:
             raise MapError(f"{path}: has no {PATTERN}")
         content = read_json(file)
         with damage_named(str(file)):
-            segments = content["lane_segments"]
-            lanes = [_lane(entry, segments) for entry in segments.values()]
-            areas = [
-                Area(str(a["id"]), "drivable", _points(a["area_boundary"]))
-                for a in content.get("drivable_areas", {}).values()
-            ]
-            for crossing in content.get("pedestrian_crossings", {}).values():
-                one, other = (_points(crossing[edge]) for edge in ("edge1", "edge2"))
-                outline = np.concatenate([one, other[::-1]])
-                areas.append(Area(f"crossing_{crossing['id']}", "crosswalk", outline))
-            kept = [lane for lane in lanes if lane is not None]
-            if not kept:
-                raise MapError(f"{file}: has no lane segments")
-            short = [str(key) for key, lane in zip(segments, lanes, strict=True) if lane is None]
-            told = f"lane segments left out because they have no length: {', '.join(short)}"
-            notes = (told,) if short else ()
-            return joined(kept, areas=areas, source=f"argoverse2 {file.name}", notes=notes)
+            return _graph(content, file)
+
+
+def _graph(content: dict[str, Any], file: Path) -> LaneGraph:
+    left_out: LeftOut = defaultdict(list)
+    segments = content["lane_segments"]
+    lanes: list[Lane] = []
+    for key, entry in segments.items():
+        with LeavingOut(left_out["lane segments left out because they cannot be read"], str(key)):
+            lanes.append(_lane(entry, segments, left_out))
+    if not segments:
+        raise MapError(f"{file}: has no lane segments")
+    check_rest(str(file), "lane segments", lanes, segments, left_out)
+    areas: list[Area] = []
+    for key, entry in _table(content, "drivable_areas", left_out).items():
+        with LeavingOut(left_out["drivable areas left out because they cannot be read"], str(key)):
+            areas.append(Area(str(entry["id"]), "drivable", _points(entry["area_boundary"])))
+    for key, entry in _table(content, "pedestrian_crossings", left_out).items():
+        with LeavingOut(left_out["crossings left out because they cannot be read"], str(key)):
+            one, other = (_points(entry[edge]) for edge in ("edge1", "edge2"))
+            outline = np.concatenate([one, other[::-1]])
+            areas.append(Area(f"crossing_{entry['id']}", "crosswalk", outline))
+    return joined(lanes, left_out, areas=areas, source=f"argoverse2 {file.name}")
+
+
+def _table(content: dict[str, Any], name: str, left_out: LeftOut) -> dict[str, Any]:
+    """Entries by their key; empty if the file lacks the table."""
+    found: Any = content.get(name, {})
+    if isinstance(found, dict):
+        return found
+    left_out["tables left out because they are not objects"].append(name)
+    return {}
 
 
 def _archive(path: Path) -> Path | None:
@@ -62,18 +87,22 @@ def _archive(path: Path) -> Path | None:
     return found[0] if found else None
 
 
-def _lane(entry: dict[str, Any], segments: dict[str, Any]) -> Lane | None:
+def _lane(entry: dict[str, Any], segments: dict[str, Any], left_out: LeftOut) -> Lane:
     left, right = _points(entry["left_lane_boundary"]), _points(entry["right_lane_boundary"])
     beside: dict[str, str | None] = {"left": None, "right": None, "opposite": None}
     for side in ("left", "right"):
-        other = segments.get(str(entry.get(f"{side}_neighbor_id")))
-        if other is not None:
+        if (name := entry.get(f"{side}_neighbor_id")) is None:
+            continue
+        if (other := segments.get(str(name))) is None:
+            beside[side] = str(name)
+            continue
+        with LeavingOut(left_out["neighbours left out because they cannot be read"], str(name)):
             same = _direction(entry) @ _direction(other) > 0
             if same or side == "left":
                 beside[side if same else "opposite"] = str(other["id"])
     shape = between(left, right)
     if shape is None:
-        return None
+        raise MapError("has no length")
     return Lane(
         str(entry["id"]),
         KINDS.get(entry["lane_type"], "other"),

@@ -16,7 +16,18 @@ from real2sim_proto.lanes import AreaKind, LaneKind, SignalKind
 
 from ..geometry import Float
 from ..scene import Area, Lane, LaneGraph, Signal, StopLine
-from .reader import MapError, between, damage_named, head_of, joined, notes_of, number, read_xml
+from .reader import (
+    LeavingOut,
+    LeftOut,
+    MapError,
+    between,
+    check_rest,
+    damage_named,
+    head_of,
+    joined,
+    number,
+    read_map_xml,
+)
 
 EARTH_M = 6_378_137.0
 KINDS: dict[str, LaneKind] = {
@@ -50,8 +61,17 @@ GERMAN_KMH = {
     ("play_street", ""): 7.0,
 }
 """Limits by subtype and location in Lanelet2's traffic rules for Germany; "" is any location."""
-SPEED = re.compile(r"^\s*([0-9]+(?:\.[0-9]*)?)\s*(km/h|kmh|mph|m/s|mps)?\s*$")
-UNITS = {"km/h": 1 / 3.6, "kmh": 1 / 3.6, "mph": 0.44704, "m/s": 1.0, "mps": 1.0, None: 1 / 3.6}
+SIGN_LIMIT = re.compile(
+    r"^(?:(?P<mph>us|gb)|de|at|fr|nl|pl)[: ]?"
+    r"(?:274(?:\.1)?|R2-1|670|52\.?a?10a|B14|A0?1|B-?33)(?:[-:_]V?|[\[(]V?)(?P<limit>[0-9]{1,3})[\])]?$",
+    re.IGNORECASE,
+)
+"""Signs of other countries and notations, such as ``usR2-1-35`` and ``DE:274[60]``."""
+SPEED = re.compile(r"^\s*([0-9]+(?:\.[0-9]*)?)\s*(km/h|kmh|kph|mph|m/s|mps)?\s*$", re.IGNORECASE)
+UNITS = {
+    "km/h": 1 / 3.6, "kmh": 1 / 3.6, "kph": 1 / 3.6, "mph": 0.44704, "m/s": 1.0, "mps": 1.0,
+    "": 1 / 3.6,
+}  # fmt: skip
 
 
 class Lanelet2Reader:
@@ -70,11 +90,11 @@ class Lanelet2Reader:
 
     def recognises(self, path: Path) -> bool:
         """Whether it is an OSM file."""
-        return path.is_file() and (path.suffix == ".osm" or b"<osm" in head_of(path))
+        return path.is_file() and (path.suffix.lower() == ".osm" or b"<osm" in head_of(path))
 
     def read(self, path: Path) -> LaneGraph:
         """The map in the frame of the file. Raises MapError: see :class:`~.reader.MapReader`."""
-        root = read_xml(path, "osm")
+        root = read_map_xml(path, "osm")
         with damage_named(str(path)):
             osm = _Osm.of(root, str(path))
             return _graph(osm, path.name)
@@ -97,14 +117,16 @@ class _Osm:
     relations: dict[str, _Relation]
     origin: str = ""
     way_of: dict[tuple[str, ...], str] = field(default_factory=dict)
-    left_out: dict[str, list[str]] = field(default_factory=dict)
+    left_out: LeftOut = field(default_factory=dict)
 
     @classmethod
     def of(cls, root: ET.Element, file: str) -> _Osm:
-        nodes, drawn, related = (_kept(root, kind) for kind in ("node", "way", "relation"))
+        left_out: LeftOut = defaultdict(list)
+        nodes, drawn, related = (
+            _kept(root, kind, left_out) for kind in ("node", "way", "relation")
+        )
         ways = {w.get("id", ""): [n.get("ref", "") for n in w.findall("nd")] for w in drawn}
-        places, origin = _places(nodes, file)
-        left_out: dict[str, list[str]] = defaultdict(list)
+        places, origin = _places(nodes, left_out)
         for way_id, refs in ways.items():
             if not all(node in places for node in refs):
                 ways[way_id] = [node for node in refs if node in places]
@@ -139,37 +161,46 @@ class _Osm:
         return [ref for kind, ref in named if kind == "way" and ref in self.ways]
 
 
-def _kept(root: ET.Element, kind: str) -> list[ET.Element]:
-    """Elements of a kind, without those that JOSM or an OSM server has marked as deleted."""
-    return [
-        e for e in root.findall(kind) if e.get("action") != "delete" and e.get("visible") != "false"
-    ]
+def _kept(root: ET.Element, kind: str, left_out: LeftOut) -> list[ET.Element]:
+    """Elements of a kind, the first of each id, without those that JOSM or an OSM server has marked
+    as deleted.
+    """
+    found: dict[str, ET.Element] = {}
+    for element in root.findall(kind):
+        if element.get("action") == "delete" or element.get("visible") == "false":
+            continue
+        key = element.get("id", "")
+        if found.setdefault(key, element) is not element:
+            left_out[f"{kind}s left out because their id is there twice"].append(key)
+    return list(found.values())
 
 
 def _tags(element: ET.Element) -> dict[str, str]:
     return {t.get("k", ""): t.get("v", "") for t in element.findall("tag")}
 
 
-def _places(nodes: Iterable[ET.Element], file: str) -> tuple[dict[str, Float], str]:
-    """Positions of nodes: local ones if all nodes have them, else on a plane about their centre."""
-    found: dict[str, Float] = {}
+def _places(nodes: Iterable[ET.Element], left_out: LeftOut) -> tuple[dict[str, Float], str]:
+    """Positions of nodes: local ones if most have them, else on a plane about their centre."""
+    local: dict[str, Float] = {}
     degrees: dict[str, tuple[float, float, float]] = {}
     for node in nodes:
-        tags, where = _tags(node), f"{file}: node {node.get('id')}"
-        height = _value(tags.get("ele", "0"), where)
-        if "local_x" in tags and "local_y" in tags:
-            found[node.get("id", "")] = np.array(
-                [_value(tags["local_x"], where), _value(tags["local_y"], where), height]
-            )
-        else:
-            lat, lon = number(node, "lat", where), number(node, "lon", where)
+        key, tags = node.get("id", ""), _tags(node)
+        with LeavingOut(left_out["nodes left out because they cannot be read"], key):
+            height = _value(tags, "ele", "0")
+            if "local_x" in tags and "local_y" in tags:
+                local[key] = np.array([_value(tags, "local_x"), _value(tags, "local_y"), height])
+                continue
+            lat, lon = number(node, "lat"), number(node, "lon")
             if abs(lat) > 89 or abs(lon) > 361:
-                raise MapError(f"{where}: latitude {lat}, longitude {lon}")
-            degrees[node.get("id", "")] = (lat, lon, height)
+                raise MapError(f"latitude {lat}, longitude {lon}")
+            degrees[key] = (lat, lon, height)
+    if local and len(local) >= len(degrees):
+        left_out["nodes left out because they lack local_x and local_y"] += degrees
+        return local, ""
+    left_out["nodes left out because few others have local_x and local_y"] += local
     if not degrees:
-        return found, ""
-    if found:
-        raise MapError(f"{file}: some nodes have local_x and local_y, others have not")
+        return {}, ""
+    found: dict[str, Float] = {}
     lat0, lon0 = np.array([(a, b) for a, b, _ in degrees.values()]).mean(axis=0).tolist()
     scale = math.radians(1) * EARTH_M
     for name, (lat, lon, height) in degrees.items():
@@ -178,13 +209,14 @@ def _places(nodes: Iterable[ET.Element], file: str) -> tuple[dict[str, Float], s
     return found, f"+proj=eqc +lat_ts={lat0!r} +lat_0={lat0!r} +lon_0={lon0!r} +R={EARTH_M}"
 
 
-def _value(text: str, where: str) -> float:
+def _value(tags: dict[str, str], name: str, default: str = "") -> float:
+    text = tags.get(name, default)
     try:
         value = float(text)
     except ValueError:
         value = math.nan
     if not abs(value) < 1e9:
-        raise MapError(f"{where}: {text[:60]!r} is not a number")
+        raise MapError(f"{name} is {text[:60]!r}, not a number")
     return value
 
 
@@ -197,39 +229,49 @@ def _graph(osm: _Osm, name: str) -> LaneGraph:
         else:
             osm.left_out["lanelets left out because they lack a rim"].append(key)
     lanes: dict[str, Lane] = {}
-    areas: list[Area] = []
+    areas: dict[str, Area] = {}
     index = _Index(rims)
-    for key, (left, right) in rims.items():
-        tags = lanelets[key].tags
-        if tags.get("subtype") == "crosswalk":
-            left_line, right_line = _oriented(osm, left, right)
-            areas.append(Area(key, "crosswalk", np.concatenate([left_line, right_line[::-1]])))
-            continue
-        shape, beside = between(*_oriented(osm, left, right)), index.beside(key)
-        if shape is None:
-            osm.left_out["lanelets left out because they have no length"].append(key)
-            continue
-        lanes[key] = Lane(
-            key,
-            KINDS.get(tags.get("subtype", "road"), "other"),
-            *shape,
-            speed_limit=_speed_limit(osm, key, lanelets[key]),
-            may_change_left=_may_cross(osm, left, "left"),
-            may_change_right=_may_cross(osm, right, "right"),
-            junction="intersection" if "turn_direction" in tags else None,
-            left=beside["left"],
-            right=beside["right"],
-            opposite=beside["opposite"],
-            successors=index.successors(key),
-        )
-    if not lanes:
+    for key, pair in rims.items():
+        with LeavingOut(osm.left_out["lanelets left out because they cannot be read"], key):
+            if lanelets[key].tags.get("subtype") == "crosswalk":
+                left, right = _oriented(osm, *pair)
+                areas[key] = Area(key, "crosswalk", np.concatenate([left, right[::-1]]))
+            else:
+                lanes[key] = _lane(osm, key, lanelets[key], index)
+    if not lanelets:
         raise MapError(f"{osm.file}: has no lanelets, relations of type lanelet with two rims")
-    areas += [a for k, r in osm.relations.items() if (a := _area(osm, k, r)) is not None]
+    check_rest(osm.file, "lanelets", {**lanes, **areas}, lanelets, osm.left_out)
+    if not lanes:
+        raise MapError(f"{osm.file}: has no lanelets except crosswalks")
+    for key, relation in osm.relations.items():
+        with LeavingOut(osm.left_out["areas left out because they cannot be read"], key):
+            if (area := _area(osm, key, relation)) is not None:
+                areas[area.area_id] = area
     stop_lines, signals = _rules(osm, lanelets, set(lanes))
     return joined(
-        lanes.values(), areas=areas, stop_lines=stop_lines, signals=signals,
-        source=f"lanelet2 {name}", geo_reference=osm.origin, notes=notes_of(osm.left_out),
+        lanes.values(), osm.left_out, areas=areas.values(), stop_lines=stop_lines, signals=signals,
+        source=f"lanelet2 {name}", geo_reference=osm.origin,
     )  # fmt: skip
+
+
+def _lane(osm: _Osm, key: str, relation: _Relation, index: _Index) -> Lane:
+    left, right = index.rims[key]
+    shape, beside = between(*_oriented(osm, left, right)), index.beside(key)
+    if shape is None:
+        raise MapError("has no length")
+    return Lane(
+        key,
+        KINDS.get(relation.tags.get("subtype", "road"), "other"),
+        *shape,
+        speed_limit=_speed_limit(osm, key, relation),
+        may_change_left=_may_cross(osm, left, "left"),
+        may_change_right=_may_cross(osm, right, "right"),
+        junction="intersection" if "turn_direction" in relation.tags else None,
+        left=beside["left"],
+        right=beside["right"],
+        opposite=beside["opposite"],
+        successors=index.successors(key),
+    )
 
 
 def _rims(osm: _Osm, relation: _Relation) -> tuple[list[str], list[str]] | None:
@@ -255,7 +297,7 @@ def _rims(osm: _Osm, relation: _Relation) -> tuple[list[str], list[str]] | None:
 
 
 def _chained(osm: _Osm, ways: list[str]) -> list[str]:
-    """Nodes of connected ways, from one end to the other."""
+    """Nodes of connected ways, from one end to the other; the others are left out with a note."""
     if not ways:
         return []
     nodes = list(osm.ways[ways[0]])
@@ -263,8 +305,8 @@ def _chained(osm: _Osm, ways: list[str]) -> list[str]:
     while rest:
         for way in rest:
             other = osm.ways[way]
-            if not other:
-                return nodes
+            if not other or not nodes:
+                continue
             if other[0] == nodes[-1]:
                 nodes += other[1:]
             elif other[-1] == nodes[-1]:
@@ -278,6 +320,7 @@ def _chained(osm: _Osm, ways: list[str]) -> list[str]:
             rest.remove(way)
             break
         else:
+            osm.left_out["ways left out because they do not continue a border"] += rest
             return nodes
     return nodes
 
@@ -374,8 +417,10 @@ def _speed(text: str) -> float | None:
         limit = int(sign[1] or 30)
         known = limit in (5, 15) or (0 < limit <= 130 and limit % 10 == 0)
         return limit / 3.6 if known else None
+    if sign := SIGN_LIMIT.match(text.strip()):
+        return (int(sign["limit"]) * UNITS["mph" if sign["mph"] else "km/h"]) or None
     found = SPEED.match(text)
-    return float(found[1]) * UNITS[found[2]] if found and float(found[1]) > 0 else None
+    return float(found[1]) * UNITS[(found[2] or "").lower()] or None if found else None
 
 
 def _area(osm: _Osm, key: str, relation: _Relation) -> Area | None:
@@ -412,7 +457,8 @@ def _rules(
         if stop is not None and len(osm.ways[stop]) >= 2:
             known = lines.get(stop)
             both = (*(known.lanes if known else ()), *waiting)
-            lines[stop] = StopLine(stop, osm.line(stop), both)
+            with LeavingOut(osm.left_out["stop lines left out because they cannot be read"], stop):
+                lines[stop] = StopLine(stop, osm.line(stop), both)
         refers = osm.member_ways(rule, "refers") or ([stop] if stop is not None else [])
         if not refers or not len(osm.ways[refers[0]]):
             osm.left_out["signals left out because they have no place"].append(key)
@@ -420,10 +466,11 @@ def _rules(
         line = osm.line(refers[0])
         x, y, z = line.mean(axis=0).tolist()
         along = line[-1] - line[0]
-        signals[key] = Signal(
-            key, kind, (x, y, z), math.atan2(along[1], along[0]) - math.pi / 2, tuple(waiting),
-            stop if stop in lines else None,
-        )  # fmt: skip
+        with LeavingOut(osm.left_out["signals left out because they cannot be read"], key):
+            signals[key] = Signal(
+                key, kind, (x, y, z), math.atan2(along[1], along[0]) - math.pi / 2, tuple(waiting),
+                stop if stop in lines else None,
+            )  # fmt: skip
     return list(lines.values()), list(signals.values())
 
 

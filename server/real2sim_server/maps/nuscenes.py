@@ -3,19 +3,33 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
+from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from real2sim_proto.lanes import AreaKind
+
 from ..geometry import Float
 from ..scene import Area, Lane, LaneGraph, Signal, StopLine
-from .reader import MapError, damage_named, head_of, joined, read_json
+from .reader import (
+    LeavingOut,
+    LeftOut,
+    MapError,
+    check_rest,
+    damage_named,
+    head_of,
+    joined,
+    read_json,
+)
 
 STEP_M = 1.0
 MAX_PIECE_M = 10_000.0
-WIDTHS_M = (2.0, 8.0)
+WIDTHS_M, USUAL_WIDTH_M = (2.0, 8.0), 3.5
+AREAS: dict[str, AreaKind] = {"ped_crossing": "crosswalk", "carpark_area": "parking"}
 
 
 class NuScenesMapReader:
@@ -29,7 +43,7 @@ class NuScenesMapReader:
 
     def recognises(self, path: Path) -> bool:
         """Whether the path is a JSON file that starts with tables of the expansion."""
-        if not path.is_file() or path.suffix != ".json":
+        if not path.is_file() or path.suffix.lower() != ".json":
             return False
         head = head_of(path)
         return b'"polygon"' in head or b'"arcline_path_3"' in head
@@ -42,13 +56,16 @@ class NuScenesMapReader:
         """
         content = read_json(path)
         with damage_named(str(path)):
-            tables = _Tables(content, str(path))
+            tables = _Tables(content)
             lanes = tables.lanes()
-            if not lanes:
-                raise MapError(f"{path}: has no lanes with an arcline_path_3")
+            given = [*tables.rows("lane"), *tables.rows("lane_connector")]
+            if not given:
+                raise MapError(f"{path}: has no lanes")
+            check_rest(str(path), "lanes", lanes, given, tables.left_out)
             stop_lines = tables.stop_lines(lanes)
             return joined(
                 lanes,
+                tables.left_out,
                 areas=tables.areas(),
                 stop_lines=stop_lines,
                 signals=tables.signals(stop_lines),
@@ -57,106 +74,131 @@ class NuScenesMapReader:
 
 
 class _Tables:
-    def __init__(self, content: dict[str, Any], file: str) -> None:
-        self.content, self.file = content, file
-        self.nodes = {n["token"]: (float(n["x"]), float(n["y"]), 0.0) for n in content["node"]}
-        self.rings = {
-            p["token"]: [self.nodes[n] for n in p["exterior_node_tokens"]]
-            for p in content["polygon"]
-        }
+    def __init__(self, content: dict[str, Any]) -> None:
+        self.content = content
+        self.left_out: LeftOut = defaultdict(list)
+        self.nodes: dict[str, tuple[float, float, float]] = {}
+        self.rings: dict[str, Float] = {}
+        for name, n in self._read("node"):
+            with self._leaving_out("nodes", name):
+                self.nodes[n["token"]] = (float(n["x"]), float(n["y"]), 0.0)
+        for name, p in self._read("polygon"):
+            with self._leaving_out("polygons", name):
+                ring = [self.nodes[node] for node in p["exterior_node_tokens"]]
+                self.rings[p["token"]] = np.array(ring).reshape(-1, 3)
+
+    def _read(self, table: str) -> Iterator[tuple[str, dict[str, Any]]]:
+        """Names and rows of a table."""
+        for i, row in enumerate(self.rows(table)):
+            known = isinstance(row, dict) and "token" in row
+            yield str(row["token"]) if known else f"row {i}", row
+
+    def _leaving_out(self, what: str, name: str) -> LeavingOut:
+        return LeavingOut(self.left_out[f"{what} left out because they cannot be read"], name)
 
     def rows(self, name: str) -> list[dict[str, Any]]:
         """Rows of a table; empty if the file lacks the table."""
-        found: list[dict[str, Any]] = self.content.get(name, [])
-        return found
+        found: Any = self.content.get(name, [])
+        if isinstance(found, list):
+            return found
+        self.left_out["tables left out because they are not lists"].append(name)
+        return []
 
     def lanes(self) -> list[Lane]:
         found = []
-        paths, follows = self.content["arcline_path_3"], self.content.get("connectivity", {})
         for table in ("lane", "lane_connector"):
-            for row in self.rows(table):
-                token = row["token"]
-                line = along(paths.get(token, ()), f"{self.file}: {table} {token}")
-                if len(line) < 2:
-                    continue
-                length = float(np.linalg.norm(np.diff(line[:, :2], axis=0), axis=1).sum())
-                ring = np.array(self.rings.get(row.get("polygon_token"), ())).reshape(-1, 3)
-                width = np.clip(_area_of(ring) / length, *WIDTHS_M) if len(ring) > 2 else 3.5
-                found.append(
-                    Lane(
-                        token,
-                        "driving",
-                        line,
-                        np.full(len(line), float(width)),
-                        successors=tuple(follows.get(token, {}).get("outgoing", ())),
-                        junction="intersection" if table == "lane_connector" else None,
-                    )
-                )
+            for name, row in self._read(table):
+                with self._leaving_out("lanes", name):
+                    found.append(self._lane(table, row))
         return found
 
+    def _lane(self, table: str, row: dict[str, Any]) -> Lane:
+        token = row["token"]
+        line = along(self.content["arcline_path_3"].get(token, ()))
+        if len(line) < 2:
+            raise MapError("has no arcline_path_3 with a length")
+        follows = self.content.get("connectivity", {}).get(token, {})
+        return Lane(
+            token,
+            "driving",
+            line,
+            np.full(len(line), self._width(token, row, line)),
+            successors=tuple(follows.get("outgoing", ())),
+            junction="intersection" if table == "lane_connector" else None,
+        )
+
+    def _width(self, token: str, row: dict[str, Any], line: Float) -> float:
+        length = float(np.linalg.norm(np.diff(line[:, :2], axis=0), axis=1).sum())
+        ring = self.rings.get(row.get("polygon_token", ""), np.zeros((0, 3)))
+        if len(ring) < 3:
+            self.left_out["lanes of 3.5 m, because they have no polygon"].append(token)
+            return USUAL_WIDTH_M
+        width = _area_of(ring) / length
+        if not WIDTHS_M[0] <= width <= WIDTHS_M[1]:
+            kind = "lanes whose polygon gives a width outside of 2 to 8 m, which is limited to that"
+            self.left_out[kind].append(token)
+        return float(np.clip(width, *WIDTHS_M))
+
+    def _ring(self, token: str) -> Float:
+        """Corners of a polygon. Raises MapError."""
+        ring = self.rings.get(token, np.zeros((0, 3)))
+        if len(ring) < 3:
+            raise MapError(f"has no polygon {token!r} with three corners")
+        return ring
+
     def areas(self) -> list[Area]:
-        found = [
-            Area(f"{row['token']}_{i}", "drivable", np.array(self.rings[token]))
-            for row in self.rows("drivable_area")
-            for i, token in enumerate(row["polygon_tokens"])
-            if len(self.rings[token]) > 2
-        ]
-        for table, kind in (("ped_crossing", "crosswalk"), ("carpark_area", "parking")):
-            for row in self.rows(table):
-                ring = self.rings[row["polygon_token"]]
-                if len(ring) > 2:
-                    found.append(Area(row["token"], kind, np.array(ring)))  # type: ignore[arg-type]
+        found = []
+        for name, row in self._read("drivable_area"):
+            for i, token in enumerate(row.get("polygon_tokens", ())):
+                with self._leaving_out("areas", f"{name}_{i}"):
+                    found.append(Area(f"{row['token']}_{i}", "drivable", self._ring(token)))
+        for table, kind in AREAS.items():
+            for name, row in self._read(table):
+                with self._leaving_out("areas", name):
+                    found.append(Area(row["token"], kind, self._ring(row["polygon_token"])))
         return found
 
     def stop_lines(self, lanes: list[Lane]) -> list[StopLine]:
         """Stop lines along the long axes of their polygons, with their lanes."""
         graph = joined([lane for lane in lanes if lane.junction is None] or lanes)
         found = []
-        for row in self.rows("stop_line"):
-            ring = np.array(self.rings.get(row.get("polygon_token"), ())).reshape(-1, 3)
-            if len(ring) < 3:
-                continue
-            middle = ring.mean(axis=0)
-            _, _, axes = np.linalg.svd((ring - middle)[:, :2], full_matrices=False)
-            reach = (ring - middle)[:, :2] @ axes[0]
-            ends = np.array([middle[:2] + r * axes[0] for r in (reach.min(), reach.max())])
-            across = np.linspace(ends[0], ends[1], 9)
-            index, values = graph.nearest_many(np.column_stack([across, np.full(9, np.nan)]))
-            near = {
-                graph.lane_ids[k]
-                for k, (_, offset) in zip(index.tolist(), values.tolist(), strict=True)
-                if k >= 0 and abs(offset) < 1.0
-            }
-            points = np.column_stack([ends, np.zeros(2)])
-            found.append(StopLine(row["token"], points, tuple(sorted(near))))
+        for name, row in self._read("stop_line"):
+            with self._leaving_out("stop lines", name):
+                ring = self._ring(row["polygon_token"])
+                middle = ring.mean(axis=0)
+                _, _, axes = np.linalg.svd((ring - middle)[:, :2], full_matrices=False)
+                reach = (ring - middle)[:, :2] @ axes[0]
+                ends = np.array([middle[:2] + r * axes[0] for r in (reach.min(), reach.max())])
+                across = np.linspace(ends[0], ends[1], 9)
+                index, values = graph.nearest_many(np.column_stack([across, np.full(9, np.nan)]))
+                near = {
+                    graph.lane_ids[k]
+                    for k, (_, offset) in zip(index.tolist(), values.tolist(), strict=True)
+                    if k >= 0 and abs(offset) < 1.0
+                }
+                points = np.column_stack([ends, np.zeros(2)])
+                found.append(StopLine(row["token"], points, tuple(sorted(near))))
         return found
 
     def signals(self, stop_lines: list[StopLine]) -> list[Signal]:
         lines = {line.stop_line_id: line for line in stop_lines}
-        waits = {
-            light: row["token"]
-            for row in self.rows("stop_line")
-            for light in row.get("traffic_light_tokens", ())
-            if row["token"] in lines
-        }
+        waits: dict[str, str] = {}
+        for name, row in self._read("stop_line"):
+            with self._leaving_out("stop lines", name):
+                if row["token"] in lines:
+                    waits |= dict.fromkeys(row.get("traffic_light_tokens", ()), row["token"])
         found = []
-        for row in self.rows("traffic_light"):
-            pose = row["pose"]
-            stop = waits.get(row["token"])
-            found.append(
-                Signal(
-                    row["token"],
-                    "traffic_light",
-                    (float(pose["tx"]), float(pose["ty"]), float(pose["tz"])),
-                    float(pose["rz"]),
-                    lines[stop].lanes if stop else (),
-                    stop,
-                )
-            )
+        for name, row in self._read("traffic_light"):
+            with self._leaving_out("signals", name):
+                pose, stop = row["pose"], waits.get(row["token"])
+                x, y, z = (float(pose[axis]) for axis in ("tx", "ty", "tz"))
+                ruled = lines[stop].lanes if stop else ()
+                heading = float(pose["rz"])
+                found.append(Signal(row["token"], "traffic_light", (x, y, z), heading, ruled, stop))
         return found
 
 
-def along(path: Any, where: str) -> Float:
+def along(path: Any) -> Float:
     """Points [N, 3] about every metre of an arcline path: pieces of three segments, each a left
     turn, a straight line or a right turn (L, S, R).
 
@@ -171,7 +213,7 @@ def along(path: Any, where: str) -> Float:
             points.append((x, y, 0.0))
         for turn, length in zip(shape, piece["segment_length"], strict=True):
             if turn not in "LSR" or not 0 <= float(length) < MAX_PIECE_M:
-                raise MapError(f"{where}: segment {turn!r} of {length} m; allowed: L, S and R")
+                raise MapError(f"segment {turn!r} of {length} m; allowed: L, S and R")
             bend = {"L": 1.0, "S": 0.0, "R": -1.0}[turn] / radius if radius > 0 else 0.0
             count = max(math.ceil(float(length) / STEP_M), 1)
             step = float(length) / count

@@ -12,13 +12,24 @@ from typing import NamedTuple
 
 import numpy as np
 
-from real2sim_proto.lanes import SignalKind
+from real2sim_proto.lanes import AreaKind, SignalKind
 
 from ..geometry import Float
 from ..scene.lane import TRAVELLED, Area, Lane, Road, RoadLane, Signal, StopLine
 from ..scene.lane_graph import LaneGraph
 from .opendrive_roads import SPEED_UNITS, OpenDriveRoad, SectionLane, read_road
-from .reader import MapError, damage_named, head_of, integer, notes_of, number, read_xml
+from .reader import (
+    LeavingOut,
+    LeftOut,
+    MapError,
+    check_rest,
+    damage_named,
+    head_of,
+    integer,
+    notes_of,
+    number,
+    read_map_xml,
+)
 
 # --- Links ---------------------------------------------------------------------------------------
 
@@ -38,10 +49,7 @@ ENDS = {"predecessor": "start", "successor": "end"}
 
 
 def joined_ends(
-    roads: Mapping[str, OpenDriveRoad],
-    junctions: list[ET.Element],
-    file: str,
-    left_out: Mapping[str, list[str]],
+    roads: Mapping[str, OpenDriveRoad], junctions: list[ET.Element], left_out: LeftOut
 ) -> set[frozenset[LaneEnd]]:
     """Pairs of connected lane ends, independent of the direction of traffic.
 
@@ -52,7 +60,7 @@ def joined_ends(
         for pair in (*_within(road), *_to_roads(road, roads)):
             found.add(frozenset(pair))
     for junction in junctions:
-        for pair in _through(junction, roads, file, left_out):
+        for pair in _through(junction, roads, left_out):
             found.add(frozenset(pair))
     named = {"road": set(roads), "junction": {j.get("id", "") for j in junctions}}
     for road in roads.values():
@@ -113,27 +121,32 @@ def _to_roads(
 
 
 def _through(
-    junction: ET.Element,
-    roads: Mapping[str, OpenDriveRoad],
-    file: str,
-    left_out: Mapping[str, list[str]],
+    junction: ET.Element, roads: Mapping[str, OpenDriveRoad], left_out: LeftOut
 ) -> Iterator[tuple[LaneEnd, LaneEnd]]:
     """Connections from incoming roads of a junction to its connecting roads."""
     name = junction.get("id", "")
-    where = f"{file}: junction {name!r}"
     for connection in junction.findall("connection"):
         incoming = connection.get("incomingRoad")
         crossing = connection.get("connectingRoad") or connection.get("linkedRoad")
         if incoming is None or crossing is None:
+            if connection.find("laneLink") is not None:
+                told = left_out["connections of junctions left out because they lack a road"]
+                told.append(f"{connection.get('id', '')} of {name}")
             continue
         if gone := [f"{name} to {road}" for road in (incoming, crossing) if road not in roads]:
             left_out["connections of junctions to a road that is not there"] += gone
             continue
         contact = connection.get("contactPoint", "start")
+        if contact not in ("start", "end"):
+            told = left_out["connections of junctions left out because of their contact point"]
+            told.append(f"{connection.get('id', '')} of {name}: {contact!r}")
+            continue
         leaves = _facing_end(roads[incoming], roads[crossing], contact, name)
         for link in connection.findall("laneLink"):
-            a, b = (integer(link, n, where) for n in ("from", "to"))
-            yield _end_of(roads[incoming], leaves, a), _end_of(roads[crossing], contact, b)
+            told = left_out["lane links of junctions left out because they cannot be read"]
+            with LeavingOut(told, f"{connection.get('id', '')} of {name}"):
+                a, b = (integer(link, n) for n in ("from", "to"))
+                yield _end_of(roads[incoming], leaves, a), _end_of(roads[crossing], contact, b)
 
 
 def _facing_end(
@@ -164,18 +177,12 @@ REACH_M = 25.0
 
 
 def read_signals(
-    roads: Mapping[str, OpenDriveRoad],
-    lines: Mapping[str, Road],
-    file: str,
-    left_out: Mapping[str, list[str]],
+    roads: Mapping[str, OpenDriveRoad], lines: Mapping[str, Road], left_out: LeftOut
 ) -> tuple[list[Signal], list[StopLine]]:
     """All signals of a file with the lanes that they control, and its stop lines.
 
     A signal without <validity> controls every lane of the direction that it faces. ``left_out``
-    receives references to signals that are not there.
-
-    Raises:
-        MapError: an attribute is absent or no number.
+    receives references to signals that are not there, and signals that cannot be read.
     """
     stop_lines: dict[str, StopLine] = {}
     signals: dict[str, Signal] = {}
@@ -186,10 +193,14 @@ def read_signals(
             declared[element.get("id", "")] = element
             placed.append((road_id, element, False))
         placed += [(road_id, e, True) for e in road.element.findall("signals/signalReference")]
+    damaged = left_out["signals left out because they cannot be read"]
     for road_id, element, _ in placed:
         if element.get("type", "") in STOP_LINE_TYPES:
             name = f"{road_id}/{element.get('id', '')}"
-            stop_lines[name] = _stop_line(name, element, roads[road_id], lines[road_id], file)
+            with LeavingOut(damaged, name):
+                line = _stop_line(name, element, roads[road_id], lines[road_id])
+                if stop_lines.setdefault(name, line) is not line:
+                    left_out["signals left out because their id is there twice"].append(name)
     for road_id, element, refers in placed:
         own = declared.get(element.get("id", "")) if refers else element
         if own is None:
@@ -198,24 +209,28 @@ def read_signals(
         if own is None or own.get("type", "") in STOP_LINE_TYPES:
             continue
         signal_id = own.get("id", "")
-        lanes = _ruled(element, roads[road_id], lines[road_id], file)
-        spans = _spans(element, f"{file}: signal {signal_id!r}")
-        numbers = {0, *(n for section in roads[road_id].sections for n in section.lanes)}
-        if spans and not any(min(a, b) <= n <= max(a, b) for a, b in spans for n in numbers):
-            name = f"{signal_id} on road {road_id}"
-            left_out["signals for lanes that are not there"].append(name)
-        if refers and signal_id in signals:
-            known = signals[signal_id]
-            signals[signal_id] = _joined(known, lanes)
-            continue
-        key = signal_id if signal_id not in signals else f"{road_id}/{signal_id}"
-        signal = _signal(own, element, lines[road_id], lanes, file)
-        signals[key] = replace(signal, signal_id=key)
+        name = f"{signal_id} on road {road_id}"
+        with LeavingOut(damaged, name):
+            lanes = _ruled(element, roads[road_id], lines[road_id])
+            spans = _spans(element)
+            numbers = {0, *(n for section in roads[road_id].sections for n in section.lanes)}
+            if spans and not any(min(a, b) <= n <= max(a, b) for a, b in spans for n in numbers):
+                left_out["signals for lanes that are not there"].append(name)
+            if refers and signal_id in signals:
+                known = signals[signal_id]
+                signals[signal_id] = _joined(known, lanes)
+                continue
+            key = signal_id if signal_id not in signals else f"{road_id}/{signal_id}"
+            if key in signals:
+                left_out["signals left out because their id is there twice"].append(name)
+                continue
+            signal = _signal(own, element, lines[road_id], lanes, left_out)
+            signals[key] = replace(signal, signal_id=key)
     return [_with_stop_line(s, stop_lines) for s in signals.values()], list(stop_lines.values())
 
 
 def read_controllers(
-    root: ET.Element, signals: Collection[str], left_out: Mapping[str, list[str]]
+    root: ET.Element, signals: Collection[str], left_out: LeftOut
 ) -> dict[str, str]:
     """The controller of each controlled signal, the first one in the file.
 
@@ -233,10 +248,9 @@ def read_controllers(
     return found
 
 
-def _ruled(element: ET.Element, road: OpenDriveRoad, line: Road, file: str) -> tuple[str, ...]:
-    where = f"{file}: signal {element.get('id', '')!r}"
-    s = min(max(number(element, "s", where), 0.0), line.length)
-    spans = _spans(element, where)
+def _ruled(element: ET.Element, road: OpenDriveRoad, line: Road) -> tuple[str, ...]:
+    s = min(max(number(element, "s"), 0.0), line.length)
+    spans = _spans(element)
     facing = element.get("orientation", "none")
     found = []
     for part in line.lanes:
@@ -258,12 +272,9 @@ def _ruled(element: ET.Element, road: OpenDriveRoad, line: Road, file: str) -> t
     return tuple(part.lane_id for part in waits.values())
 
 
-def _spans(element: ET.Element, where: str) -> list[tuple[int, int]]:
+def _spans(element: ET.Element) -> list[tuple[int, int]]:
     """First and last lanes of each <validity>."""
-    return [
-        (integer(v, "fromLane", where), integer(v, "toLane", where))
-        for v in element.findall("validity")
-    ]
+    return [(integer(v, "fromLane"), integer(v, "toLane")) for v in element.findall("validity")]
 
 
 def _is_travelled(road: OpenDriveRoad, s: float, lane: int) -> bool:
@@ -275,24 +286,39 @@ def _is_travelled(road: OpenDriveRoad, s: float, lane: int) -> bool:
 
 
 def _signal(
-    own: ET.Element, placed: ET.Element, line: Road, lanes: tuple[str, ...], file: str
+    own: ET.Element, placed: ET.Element, line: Road, lanes: tuple[str, ...], left_out: LeftOut
 ) -> Signal:
     """A signal as declared, at its position."""
-    where = f"{file}: signal {own.get('id', '')!r}"
-    s, t = number(placed, "s", where), number(placed, "t", where)
+    s, t = number(placed, "s"), number(placed, "t")
     x, y, z, heading = line.at(s, t)
     against = math.pi if own.get("orientation", "+") != "-" else 0.0
     kind = _kind(own)
-    unit = SPEED_UNITS.get(own.get("unit", ""), 1.0)
-    value = number(own, "value", where, -1.0) * unit if kind == "speed_limit" else None
+    value = None
+    if kind == "speed_limit":
+        with LeavingOut(left_out["speed limit signs without their limit"], own.get("id", "")):
+            value = _limit(own, left_out)
     return Signal(
         own.get("id", ""),
         kind,
-        (x, y, z + number(own, "zOffset", where, 0.0)),
-        heading + against + number(own, "hOffset", where, 0.0),
+        (x, y, z + number(own, "zOffset", 0.0)),
+        heading + against + number(own, "hOffset", 0.0),
         lanes,
-        value=value if value is not None and value > 0 else None,
+        value=value,
     )
+
+
+def _limit(sign: ET.Element, left_out: LeftOut) -> float:
+    """Speed limit of a sign [m/s]. Raises MapError."""
+    unit, value = sign.get("unit", ""), number(sign, "value")
+    if unit.lower() not in SPEED_UNITS:
+        raise MapError(
+            f"its unit is {unit[:40]!r}; allowed: {', '.join(u for u in SPEED_UNITS if u)}"
+        )
+    if value <= 0:
+        raise MapError(f"it is {value:g}, not above 0")
+    if not unit:
+        left_out["speed limit signs without a unit, read in m/s"].append(sign.get("id", ""))
+    return value * SPEED_UNITS[unit.lower()]
 
 
 def _kind(element: ET.Element) -> SignalKind:
@@ -311,12 +337,10 @@ def _joined(known: Signal, lanes: tuple[str, ...]) -> Signal:
     return replace(known, lanes=(*known.lanes, *lanes))
 
 
-def _stop_line(
-    name: str, element: ET.Element, road: OpenDriveRoad, line: Road, file: str
-) -> StopLine:
+def _stop_line(name: str, element: ET.Element, road: OpenDriveRoad, line: Road) -> StopLine:
     """A stop line across all controlled lanes, at the position of the signal."""
-    s = min(max(number(element, "s", f"{file}: signal {name!r}"), 0.0), line.length)
-    lanes = _ruled(element, road, line, file)
+    s = min(max(number(element, "s"), 0.0), line.length)
+    lanes = _ruled(element, road, line)
     parts = [p for p in line.lanes if p.lane_id in lanes]
     rims = [float(np.interp(s, p.s, side)) for p in parts for side in (p.inner, p.outer)] or [
         -1.5,
@@ -340,43 +364,43 @@ def _with_stop_line(signal: Signal, stop_lines: Mapping[str, StopLine]) -> Signa
 
 
 def read_crossings(
-    roads: Mapping[str, OpenDriveRoad], lines: Mapping[str, Road], file: str
+    roads: Mapping[str, OpenDriveRoad], lines: Mapping[str, Road], left_out: LeftOut
 ) -> list[Area]:
-    """Crosswalks and parking spaces among the objects with an outline.
-
-    Raises:
-        MapError: an attribute is absent or no number.
+    """Crosswalks and parking spaces among the objects with an outline; ``left_out`` receives the
+    others.
     """
-    found: list[Area] = []
+    found: dict[str, Area] = {}
+    kinds: dict[str, AreaKind] = {"crosswalk": "crosswalk", "parkingSpace": "parking"}
     for road_id, road in roads.items():
         for element in road.element.findall("objects/object"):
-            kind = {"crosswalk": "crosswalk", "parkingSpace": "parking"}.get(
-                element.get("type", "")
-            )
-            outline = _outline(element, lines[road_id], f"{file}: object of road {road_id!r}")
-            if kind is not None and len(outline) >= 3:
-                name = f"{road_id}/{element.get('id', '')}"
-                if all(name != area.area_id for area in found[-50:]):
-                    found.append(Area(name, kind, outline))  # type: ignore[arg-type]
-    return found
+            kind = kinds.get(element.get("type", ""))
+            if kind is None:
+                continue
+            name = f"{road_id}/{element.get('id', '')}"
+            with LeavingOut(left_out["crosswalks and parking spaces left out"], name):
+                if name in found:
+                    raise MapError("its id is there twice")
+                outline = _outline(element, lines[road_id])
+                if len(outline) < 3:
+                    raise MapError("has no outline of three points")
+                found[name] = Area(name, kind, outline)
+    return list(found.values())
 
 
-def _outline(element: ET.Element, line: Road, where: str) -> Float:
+def _outline(element: ET.Element, line: Road) -> Float:
     road_corners = list(element.iter("cornerRoad"))
     if road_corners:
-        st = np.array([[number(c, "s", where), number(c, "t", where)] for c in road_corners])
+        st = np.array([[number(c, "s"), number(c, "t")] for c in road_corners])
         corners: Float = line.sample(st[:, 0], st[:, 1])[:, :3]
         return corners
-    corners_uv = [
-        [number(c, "u", where), number(c, "v", where)] for c in element.iter("cornerLocal")
-    ]
+    corners_uv = [[number(c, "u"), number(c, "v")] for c in element.iter("cornerLocal")]
     if not corners_uv and element.get("length") and element.get("width"):
-        u, v = number(element, "length", where) / 2, number(element, "width", where) / 2
+        u, v = number(element, "length") / 2, number(element, "width") / 2
         corners_uv = [[u, v], [-u, v], [-u, -v], [u, -v]]
     if not corners_uv:
         return np.zeros((0, 3))
-    x, y, z, heading = line.at(number(element, "s", where), number(element, "t", where))
-    heading += number(element, "hdg", where, 0.0)
+    x, y, z, heading = line.at(number(element, "s"), number(element, "t"))
+    heading += number(element, "hdg", 0.0)
     local = np.array(corners_uv)
     cos, sin = math.cos(heading), math.sin(heading)
     places = local @ np.array([[cos, sin], [-sin, cos]]) + [x, y]
@@ -399,7 +423,7 @@ class OpenDriveReader:
 
     def recognises(self, path: Path) -> bool:
         """Whether the path is a file that begins like an OpenDRIVE file."""
-        return path.is_file() and (path.suffix == ".xodr" or b"<OpenDRIVE" in head_of(path))
+        return path.is_file() and (path.suffix.lower() == ".xodr" or b"<OpenDRIVE" in head_of(path))
 
     def read(self, path: Path) -> LaneGraph:
         """The map in the coordinates of the file, without its <offset>.
@@ -407,7 +431,7 @@ class OpenDriveReader:
         Raises:
             MapError: see :class:`~..reader.MapReader`.
         """
-        root = read_xml(path, "OpenDRIVE")
+        root = read_map_xml(path, "OpenDRIVE")
         with damage_named(str(path)):
             return _Build.of(root, str(path)).graph(path.name)
 
@@ -416,53 +440,63 @@ class OpenDriveReader:
 class _Build:
     """State of reading a file into a graph."""
 
-    file: str
     root: ET.Element
     roads: dict[str, OpenDriveRoad]
     lines: dict[str, Road]
-    left_out: Mapping[str, list[str]]
+    left_out: LeftOut
 
     @classmethod
     def of(cls, root: ET.Element, file: str) -> _Build:
-        left_out: Mapping[str, list[str]] = defaultdict(list)
+        left_out: LeftOut = defaultdict(list)
         _check_version(root, file, left_out)
         roads: dict[str, OpenDriveRoad] = {}
-        for element in root.findall("road"):
-            road = read_road(element, file, left_out)
-            if road.road_id in roads:
-                raise MapError(f"{file}: road {road.road_id!r} is there twice")
-            roads[road.road_id] = road
-        if not roads:
+        lines: dict[str, Road] = {}
+        given = root.findall("road")
+        for element in given:
+            road_id = element.get("id", "")
+            if road_id in roads:
+                left_out["roads left out because their id is there twice"].append(road_id)
+                continue
+            with LeavingOut(left_out["roads left out because they cannot be read"], road_id):
+                road = read_road(element, left_out)
+                lines[road_id], roads[road_id] = _line(road), road
+        if not given:
             raise MapError(f"{file}: has no <road>")
-        return cls(file, root, roads, {k: _line(r) for k, r in roads.items()}, left_out)
+        check_rest(file, "roads", roads, given, left_out)
+        return cls(root, roads, lines, left_out)
 
     def graph(self, name: str) -> LaneGraph:
-        made = (
-            self._lane(road, i, lane)
-            for road in self.roads.values()
-            for i, section in enumerate(road.sections)
-            for lane in section.lanes.values()
-            if is_kept(lane)
-        )
-        found = {lane.lane_id: lane for lane in made if lane is not None}
+        found: dict[str, Lane] = {}
+        for road in self.roads.values():
+            for i, section in enumerate(road.sections):
+                for lane in section.lanes.values():
+                    key = lane_id(road.road_id, i, lane.number)
+                    if not is_kept(lane):
+                        self.left_out["lanes left out because they have no width"].append(key)
+                        continue
+                    with LeavingOut(
+                        self.left_out["lanes left out because they cannot be read"], key
+                    ):
+                        found[key] = self._lane(road, i, lane)
         if not found:
-            raise MapError(f"{self.file}: none of its lanes has a width")
+            told = "; ".join(notes_of(self.left_out))
+            raise MapError(f"{name}: none of its lanes can be read ({told})")
         found = self._joined(self._beside(found))
         lines = {k: self._with_lanes(k, found) for k, road in self.lines.items()}
-        signals, stop_lines = read_signals(self.roads, lines, self.file, self.left_out)
+        signals, stop_lines = read_signals(self.roads, lines, self.left_out)
         groups = read_controllers(self.root, {s.signal_id for s in signals}, self.left_out)
         return LaneGraph.of(
             found.values(),
-            areas=read_crossings(self.roads, lines, self.file),
+            areas=read_crossings(self.roads, lines, self.left_out),
             stop_lines=stop_lines,
             signals=[replace(s, group=groups.get(s.signal_id)) for s in signals],
             roads=lines.values(),
             source=f"opendrive {name}",
-            geo_reference=_geo_reference(self.root, self.file),
+            geo_reference=_geo_reference(self.root, self.left_out),
             notes=notes_of(self.left_out),
         )
 
-    def _lane(self, road: OpenDriveRoad, index: int, lane: SectionLane) -> Lane | None:
+    def _lane(self, road: OpenDriveRoad, index: int, lane: SectionLane) -> Lane:
         line, section = self.lines[road.road_id], road.sections[index]
         inner = line.sample(section.s, lane.inner)[:, :3]
         outer = line.sample(section.s, lane.outer)[:, :3]
@@ -473,7 +507,7 @@ class _Build:
         steps = np.linalg.norm(np.diff(centre[:, :2], axis=0), axis=1)
         kept = np.concatenate([[True], steps > SAME_PLACE_M])
         if kept.sum() < 2:
-            return None
+            raise MapError("has no length")
         kept[-1] = True
         if steps[-1] <= SAME_PLACE_M:  # the end counts, not a point just before it
             kept[-2] = kept.sum() == 2
@@ -500,7 +534,7 @@ class _Build:
     def _joined(self, lanes: dict[str, Lane]) -> dict[str, Lane]:
         onward: dict[str, list[str]] = {key: [] for key in lanes}
         junctions = self.root.findall("junction")
-        pairs = joined_ends(self.roads, junctions, self.file, self.left_out)
+        pairs = joined_ends(self.roads, junctions, self.left_out)
         for pair in sorted(sorted(p) for p in pairs):
             for a, b in (pair, pair[::-1]):
                 before, after = _key(a), _key(b)
@@ -599,20 +633,20 @@ def _may_cross(lanes: dict[int, SectionLane], own: int, other: int) -> bool:
     return nearer.may_increase if other > own else nearer.may_decrease
 
 
-def _check_version(root: ET.Element, file: str, left_out: Mapping[str, list[str]]) -> None:
+def _check_version(root: ET.Element, file: str, left_out: LeftOut) -> None:
     header = root.find("header")
     major, minor = (
-        None if header is None else header.get(name) for name in ("revMajor", "revMinor")
+        "" if header is None else header.get(name, "").strip() for name in ("revMajor", "revMinor")
     )
-    if major is None and minor is None:
-        left_out["headers without a version, read as OpenDRIVE 1.8"].append("<header>")
-    elif major != "1" or not (minor or "").isdecimal() or int(minor or "") < 1:
-        raise MapError(
-            f"{file}: is of OpenDRIVE {major or '?'}.{minor or '?'}; 1.4 to 1.8 can be read"
-        )
+    known = major.isdecimal() and minor.isdecimal()
+    if known and (int(major) != 1 or int(minor) < 1):
+        raise MapError(f"{file}: is of OpenDRIVE {major}.{minor}; 1.4 to 1.8 can be read")
+    if not known:
+        given = f"{major or '?'}.{minor or '?'}"
+        left_out["headers without a version, read as OpenDRIVE 1.8"].append(given)
 
 
-def _geo_reference(root: ET.Element, file: str) -> str:
+def _geo_reference(root: ET.Element, left_out: LeftOut) -> str:
     """Projection of the file, and the offset between its coordinates and the projection.
 
     The offset is not applied, because scenes need small coordinates.
@@ -621,5 +655,7 @@ def _geo_reference(root: ET.Element, file: str) -> str:
     offset = root.find("header/offset")
     if offset is None:
         return text
-    x, y, z, heading = (number(offset, n, file, 0.0) for n in ("x", "y", "z", "hdg"))
-    return f"{text} offset x={x} y={y} z={z} hdg={heading}".strip()
+    with LeavingOut(left_out["offsets of the header that cannot be read"], "<offset>"):
+        x, y, z, heading = (number(offset, n, 0.0) for n in ("x", "y", "z", "hdg"))
+        return f"{text} offset x={x} y={y} z={z} hdg={heading}".strip()
+    return text

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
@@ -14,7 +14,7 @@ from scipy.special import fresnel
 from real2sim_proto.lanes import LaneKind
 
 from ..geometry import Float
-from .reader import MapError, integer, number
+from .reader import LeavingOut, LeftOut, MapError, integer, number
 
 # --- Plan view -----------------------------------------------------------------------------------
 
@@ -78,7 +78,7 @@ class PlanView:
         return found
 
 
-def read_plan_view(road: ET.Element, where: str) -> PlanView:
+def read_plan_view(road: ET.Element) -> PlanView:
     """The reference line of a <road>.
 
     Raises:
@@ -86,28 +86,26 @@ def read_plan_view(road: ET.Element, where: str) -> PlanView:
     """
     pieces: list[Piece] = []
     for element in road.findall("planView/geometry"):
-        s, x, y, heading = (number(element, n, where) for n in ("s", "x", "y", "hdg"))
-        length = number(element, "length", where)
+        s, x, y, heading = (number(element, n) for n in ("s", "x", "y", "hdg"))
+        length = number(element, "length")
         if not 0 <= length <= MAX_LENGTH_M:
-            raise MapError(f"{where}: geometry of length {length} m at s = {s}")
+            raise MapError(f"geometry of length {length} m at s = {s}")
         if length < 1e-9:
             continue
         if pieces and s < pieces[-1].s:
-            raise MapError(f"{where}: geometry at s = {s} follows one at s = {pieces[-1].s}")
-        local, bends = _shape(element, length, f"{where}, geometry at s = {s}")
+            raise MapError(f"geometry at s = {s} follows one at s = {pieces[-1].s}")
+        local, bends = _shape(element, length, f"geometry at s = {s}")
         pieces.append(Piece(s, length, x, y, heading, local, bends))
     if not pieces:
-        raise MapError(f"{where}: has no <planView> with a <geometry> that has a length")
+        raise MapError("has no <planView> with a <geometry> that has a length")
     return PlanView(tuple(pieces))
 
 
 def _shape(element: ET.Element, length: float, where: str) -> tuple[Local, bool]:
     kinds: dict[str, Callable[[ET.Element], Local]] = {
         "line": lambda e: line(),
-        "arc": lambda e: arc(number(e, "curvature", where)),
-        "spiral": lambda e: spiral(
-            number(e, "curvStart", where), number(e, "curvEnd", where), length
-        ),
+        "arc": lambda e: arc(number(e, "curvature")),
+        "spiral": lambda e: spiral(number(e, "curvStart"), number(e, "curvEnd"), length),
         "poly3": lambda e: _poly3(e, length, where),
         "paramPoly3": lambda e: _param_poly3(e, length, where),
     }
@@ -115,7 +113,7 @@ def _shape(element: ET.Element, length: float, where: str) -> tuple[Local, bool]
         if child.tag in kinds:
             return kinds[child.tag](child), child.tag != "line"
     given = ", ".join(child.tag for child in element) or "nothing"
-    raise MapError(f"{where}: holds {given}; known shapes are {', '.join(kinds)}")
+    raise MapError(f"{where} holds {given}; known shapes are {', '.join(kinds)}")
 
 
 def line() -> Local:
@@ -192,9 +190,9 @@ def cubic(u: tuple[float, ...], v: tuple[float, ...], end: float, length: float)
 
 
 def _poly3(element: ET.Element, length: float, where: str) -> Local:
-    v = tuple(number(element, name, where) for name in "abcd")
+    v = tuple(number(element, name) for name in "abcd")
     if max(abs(w) for w in v) > 1e6:
-        raise MapError(f"{where}: poly3 with a coefficient above a million")
+        raise MapError(f"{where} has a poly3 with a coefficient above a million")
     slope = np.polynomial.Polynomial(v).deriv()
     # Find u where the arc length reaches the length of the piece; arc length is at least the chord.
     grid = np.linspace(0.0, length, 4097)
@@ -205,16 +203,18 @@ def _poly3(element: ET.Element, length: float, where: str) -> Local:
 
 
 def _param_poly3(element: ET.Element, length: float, where: str) -> Local:
-    u, v = (tuple(number(element, name + axis, where) for name in "abcd") for axis in ("U", "V"))
+    u, v = (tuple(number(element, name + axis) for name in "abcd") for axis in ("U", "V"))
     if max(abs(w) for w in (*u, *v)) > 1e6:
-        raise MapError(f"{where}: paramPoly3 with a coefficient above a million")
+        raise MapError(f"{where} has a paramPoly3 with a coefficient above a million")
     ranges = {"arcLength": length, "normalized": 1.0}
     given = element.get("pRange", "normalized")
     if given not in ranges:
-        raise MapError(f"{where}: pRange {given!r}; allowed: {', '.join(ranges)}")
+        raise MapError(f"{where} has pRange {given!r}; allowed: {', '.join(ranges)}")
     curve = cubic(u, v, ranges[given], length)
     if not np.isfinite(curve(np.array([0.0, length]))).all():
-        raise MapError(f"{where}: paramPoly3 that is not a curve: all of its coefficients are zero")
+        raise MapError(
+            f"{where} has a paramPoly3 that is not a curve: all of its coefficients are zero"
+        )
     return curve
 
 
@@ -265,7 +265,6 @@ class Profile:
 
 def read_profile(
     elements: Iterable[ET.Element],
-    where: str,
     *,
     start: str = "s",
     base: float = 0.0,
@@ -277,7 +276,7 @@ def read_profile(
     Raises:
         MapError: an attribute is missing or not a number.
     """
-    rows = [[number(e, name, where) for name in (start, "a", "b", "c", "d")] for e in elements]
+    rows = [[number(e, name) for name in (start, "a", "b", "c", "d")] for e in elements]
     table = np.array(sorted(rows, key=lambda row: row[0])).reshape(-1, 5)
     if len(table):
         table = table[np.append(np.diff(table[:, 0]) >= shortest, True)]
@@ -314,7 +313,11 @@ KINDS: dict[str, LaneKind] = {
     "walking": "sidewalk",
 }
 """Kinds by lower-case name in the file; other types are not part of the carriageway."""
-SPEED_UNITS = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704, "": 1.0}
+SPEED_UNITS = {
+    "": 1.0, "m/s": 1.0, "mps": 1.0, "km/h": 1 / 3.6, "kmh": 1 / 3.6, "kph": 1 / 3.6,
+    "mph": 0.44704,
+}  # fmt: skip
+"""By lower-case name [m/s]."""
 CHANGES = {"none": (False, False), "increase": (True, False), "decrease": (False, True)}
 """By the marking of a lane: whether it may be crossed towards higher and lower numbers."""
 
@@ -388,49 +391,150 @@ class OpenDriveRoad:
     element: ET.Element
     s: Float
 
-    @property
-    def where(self) -> str:
-        """Name for messages."""
-        return f"road {self.road_id!r}"
+
+SAME_LENGTH_M = 0.01
 
 
-def read_road(element: ET.Element, file: str, left_out: Mapping[str, list[str]]) -> OpenDriveRoad:
-    """A road of a file; ``left_out`` receives its name for a note on its length.
+def read_road(element: ET.Element, left_out: LeftOut) -> OpenDriveRoad:
+    """A road of a file; ``left_out`` receives its parts that are left out or read otherwise.
 
     Raises:
-        MapError: names the file, the road and the problem.
+        MapError: the road has no lanes, or the course of its reference line is not known.
     """
     road_id = element.get("id", "")
-    where = f"{file}: road {road_id!r}"
-    plan = read_plan_view(element, where)
+    _leave_out_damage(element, road_id, left_out)
+    plan = read_plan_view(element)
     length = plan.length
-    if not abs(number(element, "length", where, math.inf) - length) <= max(0.1, 1e-3 * length):
+    if not abs(number(element, "length", math.inf) - length) <= SAME_LENGTH_M:
         left_out["roads with another length than their geometry, which is used"].append(road_id)
+    if any(abs(b.s - a.s - a.length) > SAME_LENGTH_M for a, b in pairwise(plan.pieces)):
+        left_out["roads with gaps or overlaps between their geometries"].append(road_id)
     junction = element.get("junction", "-1")
+    rule = element.get("rule", "RHT").upper()
+    if rule not in ("RHT", "LHT"):
+        left_out["roads with an unknown traffic rule, read as RHT"].append(f"{road_id}: {rule}")
     road = OpenDriveRoad(
         road_id=road_id,
         junction=None if junction in ("-1", "") else junction,
         length=length,
         plan=plan,
-        elevation=read_profile(element.findall("elevationProfile/elevation"), where),
-        roll=read_profile(element.findall("lateralProfile/superelevation"), where),
-        drives_right=element.get("rule", "RHT").upper() != "LHT",
-        links=_links(element),
+        elevation=read_profile(element.findall("elevationProfile/elevation")),
+        roll=read_profile(element.findall("lateralProfile/superelevation")),
+        drives_right=rule != "LHT",
+        links=_links(element, road_id, left_out),
         sections=[],
         element=element,
         s=np.zeros(0),
     )
-    starts = _section_starts(element, length, where)
-    road.s = _sample_places(element, plan, length, [s for s, _ in starts], where)
-    offset = _lateral(element.findall("lanes/laneOffset"), where)
+    for what, profile in (("elevation", road.elevation), ("superelevation", road.roll)):
+        if len(profile.starts) and profile.starts[0] > SAME_LENGTH_M:
+            left_out[f"roads whose {what} begins later than they do, 0 before"].append(road_id)
+    starts = _section_starts(element, length, road_id, left_out)
+    road.s = _sample_places(element, plan, length, [s for s, _ in starts])
+    offset = _lateral(element.findall("lanes/laneOffset"))
     ends = [s for s, _ in starts[1:]] + [length]
-    for (start, sides), end in zip(starts, ends, strict=True):
+    for i, ((start, sides), end) in enumerate(zip(starts, ends, strict=True)):
         s = road.s[(road.s >= start - SAME_S) & (road.s <= end + SAME_S)]
         middle = offset.at(s, since=start, until=end)
-        stretch = _Stretch(road, start, end, s, middle, where)
+        stretch = _Stretch(road, f"{road_id}.{i}", start, end, s, middle, left_out)
         road.sections.append(_read_section(sides, stretch))
     _continue_sides(road.sections, [sides for _, sides in starts])
     return road
+
+
+def _leave_out_damage(element: ET.Element, road_id: str, left_out: LeftOut) -> None:
+    """Take what cannot be read out of the lanes of a road, and its types.
+
+    Without the width of a lane, the places of the lanes further out are not known either.
+
+    Raises:
+        MapError: the section is one of a single side, so that its other side would be taken for
+            the missing one.
+    """
+    for kind in element.findall("type"):
+        if _is_damaged(left_out["types of roads that cannot be read"], road_id, kind, "s"):
+            element.remove(kind)
+    for i, section in enumerate(element.findall("lanes/laneSection")):
+        damaged = _damaged_lanes(section, f"{road_id}.{i}", left_out)
+        if damaged and section.get("singleSide") in ("true", "1"):
+            n = damaged[0].get("id")
+            raise MapError(f"lane {n!r} in a <laneSection> with singleSide cannot be read")
+        for side in section:
+            for lane in [lane for lane in side if lane in damaged]:
+                side.remove(lane)
+
+
+def _damaged_lanes(section: ET.Element, name: str, left_out: LeftOut) -> list[ET.Element]:
+    """Lanes that cannot be read or placed, without their other damaged parts."""
+    told = left_out["lanes left out because they cannot be read"]
+    damaged: list[ET.Element] = []
+    placed: dict[int, ET.Element] = {}
+    complete = True
+    for lane in section.findall("*/lane"):
+        number_known = False
+        with LeavingOut(told, f"{name}.{lane.get('id', '')}"):
+            n = integer(lane, "id")
+            number_known = True
+            if n in placed:
+                raise MapError("its number is there twice")
+            placed[n] = lane
+            continue
+        damaged.append(lane)
+        complete = complete and number_known
+    for side in (-1, 1):
+        further_in, is_known = 0, True
+        for n in sorted((n for n in placed if n * side > 0), key=abs):
+            own, lane = f"{name}.{n}", placed[n]
+            if n != further_in + side:
+                left_out["lanes beside a gap in the lane numbers"].append(own)
+                is_known = is_known and complete
+            further_in = n
+            if not is_known:
+                kind = "lanes left out because a lane further in cannot be read"
+                left_out[kind].append(own)
+                damaged.append(lane)
+                continue
+            is_known = False
+            with LeavingOut(told, own):
+                for records in (lane.findall("width"), lane.findall("border")):
+                    _lateral(records, start="sOffset")
+                _leave_out_parts(lane, own, left_out)
+                is_known = True
+            if not is_known:
+                damaged.append(lane)
+    return damaged
+
+
+def _leave_out_parts(lane: ET.Element, name: str, left_out: LeftOut) -> None:
+    """Take links, marks and speeds that cannot be read out of a lane."""
+    for path, attribute in (
+        ("link/predecessor", "id"),
+        ("link/successor", "id"),
+        ("roadMark", "sOffset"),
+        ("speed", "sOffset"),
+    ):
+        parent = lane.find("link") if path.startswith("link/") else lane
+        for part in lane.findall(path):
+            told = left_out["links, marks and speeds of lanes that cannot be read"]
+            if _is_damaged(told, name, part, attribute) and parent is not None:
+                parent.remove(part)
+
+
+def _is_damaged(told: list[str], name: str, element: ET.Element, attribute: str) -> bool:
+    with LeavingOut(told, name):
+        if attribute == "id":
+            integer(element, attribute)
+        else:
+            number(element, attribute, 0.0 if attribute == "sOffset" else None)
+        return False
+    return True
+
+
+def _is_number(text: str) -> bool:
+    try:
+        return float(text).is_integer()
+    except ValueError:
+        return False
 
 
 def _continue_sides(sections: list[Section], sides: list[Sides]) -> None:
@@ -442,16 +546,20 @@ def _continue_sides(sections: list[Section], sides: list[Sides]) -> None:
                 before.lanes[n].links["successor"] = lane.links["predecessor"] = n
 
 
-def _links(element: ET.Element) -> dict[str, Link]:
+def _links(element: ET.Element, road_id: str, left_out: LeftOut) -> dict[str, Link]:
     found = {}
     for end in ("predecessor", "successor"):
         link = element.find(f"link/{end}")
-        if link is not None:
-            found[end] = Link(
-                link.get("elementType", "road"),
-                link.get("elementId", ""),
-                link.get("contactPoint", "start"),
-            )
+        if link is None:
+            continue
+        kind, contact = link.get("elementType", "road"), link.get("contactPoint")
+        if contact is None and kind == "road" and link.get("elementS") is None:
+            left_out["links of roads without a contact point, read as the start"].append(road_id)
+        elif contact not in (None, "start", "end"):
+            told = left_out["links of roads left out because of their contact point"]
+            told.append(f"{road_id}: {contact!r}")
+            continue
+        found[end] = Link(kind, link.get("elementId", ""), contact or "start")
     return found
 
 
@@ -459,24 +567,29 @@ Sides = dict[int, tuple[ET.Element, float]]
 """<laneSection> that has the lanes of a side (-1: right, 1: left), and its start [m]."""
 
 
-def _section_starts(element: ET.Element, length: float, where: str) -> list[tuple[float, Sides]]:
+def _section_starts(
+    element: ET.Element, length: float, road_id: str, left_out: LeftOut
+) -> list[tuple[float, Sides]]:
     """Start of each section, with its sides. A section with ``singleSide`` keeps the other side of
     the section before it.
     """
     sections = element.findall("lanes/laneSection")
     if not sections:
-        raise MapError(f"{where}: has no <laneSection>")
-    starts = sorted(((number(e, "s", where), i) for i, e in enumerate(sections)))
-    found = [(s, sections[i]) for s, i in starts]
-    if found[0][0] > 0.01:
-        raise MapError(f"{where}: its first lane section starts at s = {found[0][0]}, not at 0")
+        raise MapError("has no <laneSection>")
+    starts = sorted(((number(e, "s"), i) for i, e in enumerate(sections)))
+    beyond = [s for s, _ in starts if s > length + SAME_LENGTH_M]
+    kind = "lane sections left out because they start after the end of their road"
+    left_out[kind] += [f"{road_id}: s = {s:g}" for s in beyond]
+    found = [(s, sections[i]) for s, i in starts if s not in beyond]
+    if not found or abs(found[0][0]) > SAME_LENGTH_M:
+        raise MapError(f"its first lane section starts at s = {starts[0][0]}, not at 0")
     found[0] = (0.0, found[0][1])
     full: list[tuple[float, Sides]] = []
     for start, section in found:
         kept = section.get("singleSide") in ("true", "1") and full
         sides = dict(full[-1][1]) if kept else {}
-        for lane in section.iter("lane"):
-            if (n := integer(lane, "id", where)) != 0:
+        for lane in section.findall("*/lane"):
+            if (n := integer(lane, "id")) != 0:
                 sides[1 if n > 0 else -1] = (section, start)
         full.append((start, sides))
     ends = [s for s, _ in found[1:]] + [length]
@@ -485,21 +598,21 @@ def _section_starts(element: ET.Element, length: float, where: str) -> list[tupl
 
 
 def _sample_places(
-    element: ET.Element, plan: PlanView, length: float, sections: list[float], where: str
+    element: ET.Element, plan: PlanView, length: float, sections: list[float]
 ) -> Float:
     """Sampled positions of a road: every start of a record, and regular ones in between."""
     breaks = {0.0, length, *sections}
     for record in element.iter():
         if record.tag in ("elevation", "superelevation", "laneOffset", "geometry"):
-            breaks.add(number(record, "s", where))
-    steps = set(_lateral(element.findall("lanes/laneOffset"), where).steps())
+            breaks.add(number(record, "s"))
+    steps = set(_lateral(element.findall("lanes/laneOffset")).steps())
     for section in element.findall("lanes/laneSection"):
-        base = number(section, "s", where)
-        for lane in section.iter("lane"):
+        base = number(section, "s")
+        for lane in section.findall("*/lane"):
             for tag in ("width", "border"):
                 records = lane.findall(tag)
-                breaks |= {base + number(r, "sOffset", where, 0.0) for r in records}
-                steps |= set(_lateral(records, where, start="sOffset", base=base).steps())
+                breaks |= {base + number(r, "sOffset", 0.0) for r in records}
+                steps |= set(_lateral(records, start="sOffset", base=base).steps())
     for s in steps:
         if min(abs(s - section) for section in (*sections, length)) > SAME_START_M:
             breaks |= {s - 2 * JUMP_M, s - JUMP_M, s, s + JUMP_M}
@@ -519,35 +632,34 @@ def _sample_places(
         places.append(np.linspace(a, b, max(int(np.ceil((b - a) / step)), 1), endpoint=False))
     found = np.concatenate([*places, [length]])
     if len(found) > MAX_SAMPLES:
-        raise MapError(f"{where}: needs {len(found)} samples, above {MAX_SAMPLES}")
+        raise MapError(f"needs {len(found)} samples, above {MAX_SAMPLES}")
     return found
 
 
-def _lateral(
-    elements: list[ET.Element], where: str, *, start: str = "s", base: float = 0.0
-) -> Profile:
+def _lateral(elements: list[ET.Element], *, start: str = "s", base: float = 0.0) -> Profile:
     """The profile of a lane offset, width or border; a step between two records is one step."""
-    return read_profile(elements, where, start=start, base=base, shortest=SAME_START_M)
+    return read_profile(elements, start=start, base=base, shortest=SAME_START_M)
 
 
 @dataclass(frozen=True)
 class _Stretch:
-    """Geometry of a lane section: its road, the sampled positions, t of its centre line.
+    """Geometry of a lane section: its road and name, the sampled positions, t of its centre line.
 
     ``base`` is the start of the <laneSection> with the lanes, from which their offsets count [m].
     """
 
     road: OpenDriveRoad
+    name: str
     start: float
     end: float
     s: Float
     middle: Float
-    where: str
+    left_out: LeftOut
     base: float = 0.0
 
     def profile(self, elements: list[ET.Element]) -> Float:
         """Values [M] of records that begin at their ``sOffset``."""
-        records = _lateral(elements, self.where, start="sOffset", base=self.base)
+        records = _lateral(elements, start="sOffset", base=self.base)
         return records.at(self.s, since=self.start, until=self.end)
 
 
@@ -555,12 +667,7 @@ def _read_section(sides: Sides, stretch: _Stretch) -> Section:
     section = Section(stretch.s)
     for side, (element, base) in sorted(sides.items()):
         at = replace(stretch, base=base)
-        by_number: dict[int, ET.Element] = {}
-        for lane in element.iter("lane"):
-            index = integer(lane, "id", at.where)
-            if index in by_number:
-                raise MapError(f"{at.where}: lane {index} is there twice at s = {at.start}")
-            by_number[index] = lane
+        by_number = {integer(lane, "id"): lane for lane in element.findall("*/lane")}
         inner = at.middle
         for n in sorted((n for n in by_number if n * side > 0), key=abs):
             outer = _outer(by_number[n], inner, side, at)
@@ -574,8 +681,12 @@ def _outer(lane: ET.Element, inner: Float, side: int, at: _Stretch) -> Float:
     borders = lane.findall("border")
     if borders:
         return at.middle + at.profile(borders)
-    width: Float = np.maximum(at.profile(lane.findall("width")), 0.0)
-    return inner + side * width
+    width = at.profile(lane.findall("width"))
+    if (width < -SAME_LENGTH_M).any():
+        kind = "lanes with a width below 0 in places, which is read as 0"
+        at.left_out[kind].append(f"{at.name}.{lane.get('id')}")
+    outer: Float = inner + side * np.maximum(width, 0.0)
+    return outer
 
 
 def _section_lane(lane: ET.Element, n: int, rims: tuple[Float, Float], at: _Stretch) -> SectionLane:
@@ -583,7 +694,7 @@ def _section_lane(lane: ET.Element, n: int, rims: tuple[Float, Float], at: _Stre
     for link in ("predecessor", "successor"):
         found = lane.find(f"link/{link}")
         if found is not None:
-            links[link] = integer(found, "id", at.where)
+            links[link] = integer(found, "id")
     mark = _road_mark(lane, at)
     change = "both"
     if mark is not None:
@@ -607,31 +718,36 @@ def _road_mark(lane: ET.Element, at: _Stretch) -> ET.Element | None:
     """The mark at the start of the section, otherwise the first one."""
     marks = lane.findall("roadMark")
     if at.base < at.start:
-        passed = [
-            m for m in marks if at.base + number(m, "sOffset", at.where, 0.0) <= at.start + SAME_S
-        ]
+        passed = [m for m in marks if at.base + number(m, "sOffset", 0.0) <= at.start + SAME_S]
         marks = passed[-1:] or marks
     return marks[0] if marks else None
 
 
 def _speed_limit(lane: ET.Element, at: _Stretch) -> float | None:
     """Speed limit of the lane at the middle of its section, otherwise of the road there."""
-    where, middle = at.where, (at.start + at.end) / 2
-    own = [(at.base + number(e, "sOffset", where, 0.0), e) for e in lane.findall("speed")]
-    types = [(number(e, "s", where), e) for e in at.road.element.findall("type")]
+    middle = (at.start + at.end) / 2
+    own = [(at.base + number(e, "sOffset", 0.0), e) for e in lane.findall("speed")]
+    types = [(number(e, "s", 0.0), e) for e in at.road.element.findall("type")]
     of_road = [(s, speed) for s, e in types if (speed := e.find("speed")) is not None]
     for records in (own, of_road):
         before = [(s, e) for s, e in records if s <= middle]
         if before:
-            return _speed(max(before, key=lambda record: record[0])[1], where)
+            name = f"{at.name}.{lane.get('id')}"
+            with LeavingOut(at.left_out["lanes without their speed limit"], name):
+                return _speed(max(before, key=lambda record: record[0])[1])
+            return None
     return None
 
 
-def _speed(element: ET.Element, where: str) -> float | None:
-    if element.get("max") in ("no limit", "undefined", None):
+def _speed(element: ET.Element) -> float | None:
+    given, unit = element.get("max", ""), element.get("unit", "")
+    if given.lower() in ("no limit", "undefined"):
         return None
-    unit = element.get("unit", "")
-    if unit not in SPEED_UNITS:
-        raise MapError(f"{where}: speed in {unit!r}; allowed: {', '.join(u for u in SPEED_UNITS)}")
-    value = number(element, "max", where) * SPEED_UNITS[unit]
-    return value if value > 0 else None
+    if unit.lower() not in SPEED_UNITS:
+        raise MapError(
+            f"its unit is {unit[:40]!r}; allowed: {', '.join(u for u in SPEED_UNITS if u)}"
+        )
+    value = number(element, "max")
+    if value <= 0:
+        raise MapError(f"it is {given!r}, not above 0")
+    return value * SPEED_UNITS[unit.lower()]

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-import codecs
 import json
 import math
-import re
 import xml.etree.ElementTree as ET
-from collections.abc import Iterable, Iterator, Mapping
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sized
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
+from .._files import read_text, read_xml
 from ..geometry import Float
-from ..scene import Lane, LaneGraph
+from ..scene import Lane, LaneGraph, SceneError
 
 
 class MapReader(Protocol):
@@ -68,7 +68,53 @@ def damage_named(where: str) -> Iterator[None]:
         raise MapError(f"{where}: is damaged, or not as its format asks ({reason})") from error
 
 
-# --- Notes ---------------------------------------------------------------------------------------
+# --- Parts that are left out ----------------------------------------------------------------------
+
+LeftOut = dict[str, list[str]]
+"""Names of parts by what a reader did with them, such as "roads left out because ..."."""
+
+DAMAGE = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError, SceneError)
+"""What reading a damaged part raises."""
+
+
+@dataclass
+class LeavingOut:
+    """Leaves out what the block reads if it is damaged; its name and the reason go to ``told``."""
+
+    told: list[str]
+    name: str
+
+    def __enter__(self) -> None:
+        """Begin to read the part."""
+
+    def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> bool:
+        """Whether the part is left out."""
+        if not isinstance(error, DAMAGE):
+            return False
+        reason = str(error) if isinstance(error, MapError | SceneError) else _reason(error)
+        self.told.append(f"{self.name}: {reason}")
+        return True
+
+
+def _reason(error: BaseException) -> str:
+    return f"lacks {error}" if isinstance(error, KeyError) else f"{type(error).__name__}, {error}"
+
+
+def check_rest(
+    file: str, what: str, rest: Sized, given: Sized, left_out: Mapping[str, list[str]]
+) -> None:
+    """Refuse a map of which nothing is left, or less than half.
+
+    Raises:
+        MapError: names the file and what was left out.
+    """
+    if len(rest) and 2 * len(rest) >= len(given):
+        return
+    if len(rest):
+        lost = f"{len(given) - len(rest)} of its {len(given)} {what} cannot be read, more than half"
+    else:
+        lost = f"none of its {len(given)} {what} can be read"
+    raise MapError(f"{file}: {lost} ({'; '.join(notes_of(left_out))})")
 
 
 def notes_of(left_out: Mapping[str, Iterable[str]]) -> tuple[str, ...]:
@@ -77,7 +123,7 @@ def notes_of(left_out: Mapping[str, Iterable[str]]) -> tuple[str, ...]:
     for kind, given in left_out.items():
         if not (names := list(dict.fromkeys(given))):
             continue
-        first = ", ".join(name[:60] for name in names[:5])
+        first = ", ".join(name[:160] for name in names[:5])
         notes.append(f"{kind}: {len(names)} ({first}{', ...' if len(names) > 5 else ''})")
     return tuple(notes)
 
@@ -96,7 +142,7 @@ def read_json(path: Path) -> dict[str, Any]:
     try:
         if path.stat().st_size > MAX_BYTES:
             raise MapError(f"{path}: is larger than {MAX_BYTES >> 20} MiB, the most that is read")
-        content = json.loads(path.read_bytes())
+        content = json.loads(read_text(path))
     except OSError as error:
         raise MapError(f"{path}: cannot be read ({error.strerror})") from error
     except (ValueError, RecursionError) as error:
@@ -108,14 +154,8 @@ def read_json(path: Path) -> dict[str, Any]:
 
 # --- XML -----------------------------------------------------------------------------------------
 
-# Files are untrusted.
 
-
-_DECLARATION = re.compile(r"<\?xml\s.*?\?>", re.DOTALL)
-_BEFORE_DECLARATION = re.compile(rb"(?:\xef\xbb\xbf)?(?>\s+|<!--.*?-->)++(?=<\?xml\s)", re.DOTALL)
-
-
-def read_xml(path: Path, root: str) -> ET.Element:
+def read_map_xml(path: Path, root: str) -> ET.Element:
     """The root element of an XML file.
 
     Args:
@@ -126,29 +166,13 @@ def read_xml(path: Path, root: str) -> ET.Element:
         MapError: no such file, too large, not XML, with a document type, or another root.
     """
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise MapError(f"{path}: is larger than {MAX_BYTES >> 20} MiB, the most that is read")
-        data = path.read_bytes()
+        found = read_xml(path)
     except OSError as error:
         raise MapError(f"{path}: cannot be read ({error.strerror})") from error
-    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        data = _DECLARATION.sub("", data.decode("utf-16", "replace")).encode()
-    if before := _BEFORE_DECLARATION.match(data):
-        data = data[before.end() :]
-    # Entities could expand a small file until it fills the memory; maps do not need them.
-    if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
-        raise MapError(f"{path}: declares a document type or entities; maps have none")
-    try:
-        found = ET.fromstring(data)
-    except (ET.ParseError, ValueError, LookupError) as error:
-        raise MapError(f"{path}: is not an XML file ({error})") from error
-    # Elements of other namespaces, such as those in <userData>, keep them and are not read.
-    namespace, brace, tag = found.tag.rpartition("}")
-    if brace:
-        for element in found.iter():
-            element.tag = element.tag.removeprefix(namespace + brace)
-    if tag != root:
-        raise MapError(f"{path}: its root is <{tag}>, expected <{root}>")
+    except ValueError as error:
+        raise MapError(f"{path}: {error}") from error
+    if found.tag != root:
+        raise MapError(f"{path}: its root is <{found.tag}>, expected <{root}>")
     return found
 
 
@@ -161,7 +185,7 @@ def head_of(path: Path, size: int = 4096) -> bytes:
         return b""
 
 
-def number(element: ET.Element, name: str, where: str, default: float | None = None) -> float:
+def number(element: ET.Element, name: str, default: float | None = None) -> float:
     """A finite attribute; ``default`` if it is missing.
 
     Raises:
@@ -176,15 +200,15 @@ def number(element: ET.Element, name: str, where: str, default: float | None = N
         value = math.nan
     if not abs(value) < 1e12:
         given = "nothing" if text is None else repr(text[:80])
-        raise MapError(f"{where}: {name} of <{element.tag}> must be a number, found {given}")
+        raise MapError(f"{name} of <{element.tag}> must be a number, found {given}")
     return value
 
 
-def integer(element: ET.Element, name: str, where: str) -> int:
+def integer(element: ET.Element, name: str) -> int:
     """An integer attribute. Raises MapError."""
-    value = number(element, name, where)
+    value = number(element, name)
     if value != int(value):
-        raise MapError(f"{where}: {name} of <{element.tag}> must be whole, not {value}")
+        raise MapError(f"{name} of <{element.tag}> must be whole, not {value}")
     return int(value)
 
 
@@ -196,6 +220,7 @@ FIT_M = 0.03
 """Accepted distance between the borders of a lane and the given ones [m]."""
 CORNER = math.radians(3.0)
 """Minimum turn of a centre line that is kept exactly [rad]."""
+MAX_BORDER_M = 1e5
 MAX_COMPARED = 2_000_000
 """Maximum number of pairs of a point and a segment that are compared for a lane: about a second."""
 
@@ -207,6 +232,9 @@ def between(left: Float, right: Float) -> tuple[Float, Float] | None:
     Both borders are traversed in parallel, by their share of length, as in Lanelet2 and Argoverse.
     If the borders of the result leave the given ones, as beside kinks, nearest points are paired,
     unless the lane is a kilometre long with points every metre.
+
+    Raises:
+        MapError: a border is longer than 100 km, or its points are not numbers.
     """
     if len(left) < 2 or len(right) < 2:
         return None
@@ -218,6 +246,8 @@ def between(left: Float, right: Float) -> tuple[Float, Float] | None:
     lengths = [float(_along(rim)[-1]) for rim in (left, right)]
     if max(lengths) < SAME_PLACE_M:
         return None
+    if not all(length < MAX_BORDER_M for length in lengths):
+        raise MapError(f"its borders are {lengths[0]:g} and {lengths[1]:g} m long")
     count = max(int(np.ceil(max(lengths) / STEP_M)), 1) + 1
     a, b = (_at(r, np.linspace(0.0, s, count)) for r, s in zip((left, right), lengths, strict=True))
     centre, widths = (a + b) / 2, np.linalg.norm((a - b)[:, :2], axis=1)
@@ -321,21 +351,53 @@ def _misfit(shape: tuple[Float, Float] | None, left: Float, right: Float) -> flo
     return off
 
 
-def joined(lanes: Iterable[Lane], **parts: Any) -> LaneGraph:
-    """A graph of lanes without references to lanes outside a map section.
+_IDS = {
+    "areas": "area_id",
+    "stop_lines": "stop_line_id",
+    "signals": "signal_id",
+}
+
+
+def joined(lanes: Iterable[Lane], left_out: LeftOut | None = None, **parts: Any) -> LaneGraph:
+    """A graph of lanes without references to lanes that are not there.
+
+    Args:
+        lanes: the first one of each id is kept.
+        left_out: receives the links to other lanes, and becomes the notes of the graph.
+        **parts: as for :meth:`LaneGraph.of`; the first part of each id is kept.
 
     Raises:
         SceneError: as :meth:`LaneGraph.of`.
     """
-    there = {lane.lane_id: lane for lane in lanes}
-    kept = [
-        replace(
-            lane,
-            successors=tuple(n for n in lane.successors if n in there),
-            left=lane.left if lane.left in there else None,
-            right=lane.right if lane.right in there else None,
-            opposite=lane.opposite if lane.opposite in there else None,
-        )
-        for lane in there.values()
-    ]
+    told: LeftOut = defaultdict(list) if left_out is None else left_out
+    there = unique(lanes, "lane_id", told["lanes left out because their id is there twice"])
+    absent = told["links to lanes that are not in the file"]
+    kept = []
+    for lane in there.values():
+        beside = {side: getattr(lane, side) for side in ("left", "right", "opposite")}
+        named = (*lane.successors, *(name for name in beside.values() if name is not None))
+        absent += [f"{lane.lane_id} to {name}" for name in named if name not in there]
+        successors = tuple(name for name in lane.successors if name in there)
+        beside = {side: name if name in there else None for side, name in beside.items()}
+        kept.append(replace(lane, successors=successors, **beside))
+    for name, key in _IDS.items():
+        twice = told[f"{name.replace('_', ' ')} left out because their id is there twice"]
+        parts[name] = unique(parts.get(name, ()), key, twice).values()
+    if left_out is not None:
+        parts["notes"] = notes_of(told)
     return LaneGraph.of(kept, **parts)
+
+
+Part = TypeVar("Part")
+
+
+def unique(parts: Iterable[Part], key: str, twice: list[str]) -> dict[str, Part]:
+    """The first part of each id; ``twice`` receives the ids of the others."""
+    found: dict[str, Part] = {}
+    for part in parts:
+        name = getattr(part, key)
+        if name in found:
+            twice.append(name)
+        else:
+            found[name] = part
+    return found

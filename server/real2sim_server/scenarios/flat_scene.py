@@ -243,8 +243,8 @@ def _graph(board: Storyboard, road_file: Path | None) -> LaneGraph | None:
         return None
     if road_file is None or not road_file.is_file():
         raise ScenarioError(
-            f"the road network {board.roads.file!r} of the scenario does not exist; put it where "
-            "the file says, or run the scenario on a scene"
+            f"the road network {str(road_file or board.roads.file)!r} of the scenario does not "
+            "exist; put it there, or run the scenario on a scene"
         )
     return read_map(road_file)
 

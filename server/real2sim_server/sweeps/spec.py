@@ -160,7 +160,7 @@ class StoryboardSpace:
 
 def is_scenario(name: str) -> bool:
     """Whether a name refers to a scenario file or a gallery case."""
-    return name.startswith(GALLERY) or name.endswith(".xosc")
+    return name.startswith(GALLERY) or name.lower().endswith(".xosc")
 
 
 def read_scenario(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import xml.etree.ElementTree as ET
 
 import numpy as np
@@ -114,7 +115,7 @@ def test_roads_keep_their_reference_lines_within_a_millimetre(tmp_path, kind):
     length = 40.0
     geometry = f'<geometry s="0" x="3" y="-2" hdg="0.7" length="{length}">{SHAPES[kind]}</geometry>'
     road = read_map(one_road(tmp_path, geometry, length)).road("7")
-    plan = read_plan_view(ET.fromstring(f"<road><planView>{geometry}</planView></road>"), "here")
+    plan = read_plan_view(ET.fromstring(f"<road><planView>{geometry}</planView></road>"))
     s = np.random.default_rng(5).uniform(0, length, 500)
     exact, stored = plan.at(s), road.sample(s)
     assert np.abs(stored[:, :2] - exact[:, :2]).max() < 1e-3
@@ -304,7 +305,10 @@ def test_a_lane_offset_changes_at_the_border_of_its_section(tmp_path):
         (f"<OpenDRIVE>{HEADER}</OpenDRIVE>", "no <road>"),
         ('<OpenDRIVE><header revMajor="2" revMinor="0"/></OpenDRIVE>', "2.0"),
         ('<!DOCTYPE a [<!ENTITY b "c">]><OpenDRIVE/>', "document type"),
-        (f'<OpenDRIVE>{HEADER}<road id="a" length="5"/></OpenDRIVE>', "road 'a'.*planView"),
+        (
+            f'<OpenDRIVE>{HEADER}<road id="a" length="5"/></OpenDRIVE>',
+            "none of its 1 roads.*a: has no <planView>",
+        ),
         (
             f'<OpenDRIVE>{HEADER}<road id="a" length="5"><planView><geometry s="0" x="0" y="0" '
             'hdg="0" length="5"><curl/></geometry></planView></road></OpenDRIVE>',
@@ -318,3 +322,170 @@ def test_invalid_maps_are_refused_by_name(tmp_path, text, reason):
     with pytest.raises(MapError, match=reason) as caught:
         read_map(path)
     assert "bad.xodr" in str(caught.value)
+
+
+def road(key, *, more="", sections=None, geometry=None, attributes=""):
+    """A straight road of 100 m with lanes -1 and -2, after the road before it."""
+    lanes = sections or section(0, right=lane(-1) + lane(-2))
+    line = f'<geometry s="0" x="{100 * key}" y="0" hdg="0" length="100"><line/></geometry>'
+    return (
+        f'<road id="{key}" length="100" junction="-1" {attributes}><planView>{geometry or line}'
+        f"</planView><lanes>{lanes}</lanes>{more}</road>"
+    )
+
+
+def read_roads(tmp_path, *roads):
+    path = tmp_path / "map.xodr"
+    path.write_text(f"<OpenDRIVE>{HEADER}{''.join(roads)}</OpenDRIVE>")
+    return read_map(path)
+
+
+WIDE = '<width sOffset="0" a="3" b="0" c="0" d="0"/>'
+THREE = section(0, right=lane(-1) + lane(-2) + lane(-3))
+SIGN = '<signals><signal id="s" s="50" t="0" orientation="+" type="205"/>{}</signals>'
+
+
+@pytest.mark.parametrize(
+    ("damaged", "lost", "note"),
+    [
+        ("", "2.0.-1 2.0.-2", None),
+        (road(2, geometry="<geometry/>"), "2.0.-1 2.0.-2", "roads .* read: 1 .2: s of <geometry>"),
+        (road(2).replace('hdg="0"', 'hdg="nan"'), "2.0.-1 2.0.-2", "2: hdg of .* found 'nan'"),
+        (road(2).replace("<line/>", "<curl/>"), "2.0.-1 2.0.-2", "2: geometry at .* holds curl"),
+        (road(2, sections=" "), "2.0.-1 2.0.-2", "2: has no <laneSection>"),
+        (road(2) + road(2), "", r"roads .* id is there twice: 1 \(2\)"),
+        (road(2, sections=THREE.replace('id="-2"', 'id="x"')), "2.0.-2", "2.0.x: id of <lane>"),
+        (
+            road(2, sections=THREE.replace(WIDE, WIDE.replace('"3"', '"wide"'), 1)),
+            "2.0.-1 2.0.-2",
+            r"a lane further in cannot be read: 2 \(2.0.-2, 2.0.-3\)",
+        ),
+        (road(2, sections=THREE.replace(WIDE, "", 1)), "2.0.-1", r"have no width: 1 \(2.0.-1\)"),
+        (road(2, sections=section(0, right=lane(-1) * 2)), "2.0.-2", "2.0.-1: its number is there"),
+        (road(2, sections=section(0, right=lane(-2))), "2.0.-1", r"a gap in .*: 1 \(2.0.-2\)"),
+        (
+            road(2, sections=section(0, right=lane(-1) + lane(-2)) + section(150, right=lane(-1))),
+            "",
+            "sections left out because they start after the end of their road: 1 .2: s = 150",
+        ),
+        (
+            road(2, sections=section(0, right=lane(-1, links='<successor id="a"/>') + lane(-2))),
+            "",
+            "links, marks and speeds .* read: 1 .2.0.-1: id of <successor>",
+        ),
+        (road(2, more=SIGN.format('<signal id="t" s="x"/>')), "", "signals left .*t on road 2: s"),
+        (road(2, more="<objects><object type='crosswalk' id='c'/></objects>"), "", "2/c: has no"),
+        (road(2, attributes='rule="left"'), "", "unknown traffic rule, read as RHT: 1 .2: LEFT"),
+        (road(2, sections=THREE.replace('a="3"', 'a="-3"', 1)), "2.0.-1", "width below 0 .*2.0.-1"),
+    ],
+)  # fmt: skip
+def test_a_damaged_part_costs_nothing_else(tmp_path, damaged, lost, note):
+    """All lanes of other roads, and the other lanes of its own, stay bit for bit."""
+    whole = read_roads(tmp_path, road(1), road(2), road(3))
+    graph = read_roads(tmp_path, road(1), damaged, road(3))
+    assert set(whole.lanes) - set(graph.lanes) == set(lost.split())
+    for key in ("1.0.-1", "1.0.-2", "3.0.-1", "3.0.-2"):
+        assert np.array_equal(graph.lane(key).centre, whole.lane(key).centre)
+        assert np.array_equal(graph.lane(key).widths, whole.lane(key).widths)
+    assert whole.notes == ()
+    assert (note is None and not graph.notes) or any(re.search(note, n) for n in graph.notes)
+
+
+@pytest.mark.parametrize(
+    ("connection", "note"),
+    [
+        ('<laneLink from="x" to="-1"/>', "lane links of junctions .*0 of 9: from of <laneLink>"),
+        ('<laneLink from="-7" to="-1"/>', r"lane links to a lane that is not there: 1 \(1.0.-7\)"),
+        ('contact="middle"', "because of their contact point: 1 .0 of 9: 'middle'"),
+        ("no road", r"because they lack a road: 1 \(0 of 9\)"),
+    ],
+)
+def test_a_damaged_connection_costs_no_other(tmp_path, connection, note):
+    link = '<laneLink from="-2" to="-2"/>'
+    given = 'incomingRoad="1" ' * (connection != "no road") + 'connectingRoad="2" contactPoint='
+    damaged = f'<connection id="0" {given}"start">{connection}</connection>'
+    if connection.startswith("contact"):
+        damaged = f'<connection id="0" {given}"middle">{link}</connection>'
+    if connection == "no road":
+        damaged = damaged.replace(connection, link)
+    sound = f'<connection id="1" incomingRoad="1" connectingRoad="2" contactPoint="start">{link}'
+    into = '<link><successor elementType="junction" elementId="9"/></link>'
+    junction = f'<junction id="9">{damaged}{sound}</connection></junction>'
+    graph = read_roads(tmp_path, road(1, more=into), road(2, attributes=""), junction)
+    assert graph.lane("1.0.-2").successors == ("2.0.-2",)
+    assert [n for n in graph.notes if re.search(note, n)] == list(graph.notes)
+
+
+def test_all_damage_of_a_file_is_told_at_once(tmp_path):
+    other = road(2).replace('hdg="0"', 'hdg="nan"')
+    graph = read_roads(tmp_path, road(1), other, road(3, more=SIGN.format("<signal/>")))
+    assert len(graph.notes) == 2
+
+
+def test_a_map_of_which_more_than_half_is_damaged_is_refused(tmp_path):
+    damaged = [road(k).replace('hdg="0"', 'hdg="nan"') for k in (1, 2, 3)]
+    assert len(read_roads(tmp_path, *damaged, road(4), road(5), road(6)).lanes) == 6
+    with pytest.raises(MapError, match=r"3 of its 5 roads .* more than half.*1: hdg of <geometry>"):
+        read_roads(tmp_path, *damaged, road(4), road(5))
+
+
+@pytest.mark.parametrize(
+    ("limit", "speed", "note"),
+    [
+        ('max="30" unit="MPH"', 30 * 0.44704, None),
+        ('max="50" unit="km/h"', 50 / 3.6, None),
+        ('max="12.5"', 12.5, None),
+        ('max="no limit"', None, None),
+        ('max="undefined"', None, None),
+        ('max="50" unit="knots"', None, "its unit is 'knots'"),
+        ('max="-50" unit="km/h"', None, "'-50', not above 0"),
+        ('max="fast"', None, "found 'fast'"),
+    ],
+)
+def test_speed_limits_are_read_in_their_unit_or_noted(tmp_path, limit, speed, note):
+    limited = lane(-1, links="").replace("</lane>", f'<speed sOffset="0" {limit}/></lane>')
+    graph = read_roads(tmp_path, road(1, sections=section(0, right=limited)))
+    assert graph.lane("1.0.-1").speed_limit == (None if speed is None else pytest.approx(speed))
+    assert graph.notes == () if note is None else note in graph.notes[0]
+
+
+def test_gaps_of_profiles_and_geometries_are_noted(tmp_path):
+    line = '<geometry s="{}" x="{}" y="0" hdg="0" length="40"><line/></geometry>'
+    elevation = '<elevationProfile><elevation s="20" a="5" b="0" c="0" d="0"/></elevationProfile>'
+    given = road(1, geometry=line.format(0, 0) + line.format(60, 60), more=elevation)
+    assert read_roads(tmp_path, given).notes == (
+        "roads with gaps or overlaps between their geometries: 1 (1)",
+        "roads whose elevation begins later than they do, 0 before: 1 (1)",
+    )
+
+
+def test_removing_any_element_leaves_the_other_roads_as_they_are(tmp_path):
+    """What is read and what the notes count adds up to the roads of the file."""
+    links = (
+        '<link><predecessor elementType="road" elementId="{}" contactPoint="end"/>'
+        '<successor elementType="road" elementId="{}" contactPoint="start"/></link>'
+    )
+    onward = lane(-1, links='<predecessor id="-1"/><successor id="-1"/>') + lane(-2)
+    roads = [
+        road(k, more=links.format((k - 2) % 5 + 1, k % 5 + 1), sections=section(0, right=onward))
+        for k in range(1, 6)
+    ]
+    whole = read_roads(tmp_path, *roads)
+    text = f"<OpenDRIVE>{''.join(roads)}</OpenDRIVE>"
+    paths = [(p, c) for p, e in enumerate(ET.fromstring(text).iter()) for c in range(len(e))]
+    for parent, child in paths:
+        root = ET.fromstring(text)
+        holder = list(root.iter())[parent]
+        element = holder[child]
+        own = next(r.get("id") for r in root if element in r.iter())
+        holder.remove(element)
+        graph = read_roads(tmp_path, *(ET.tostring(r, "unicode") for r in root))
+        kept = {key: lane for key, lane in whole.lanes.items() if not key.startswith(f"{own}.")}
+        for key, before in kept.items():
+            assert np.array_equal(graph.lane(key).centre, before.centre)
+            assert np.array_equal(graph.lane(key).widths, before.widths)
+        told = "; ".join(graph.notes)
+        lost = re.search(r"roads left out because they cannot be read: (\d+)", told)
+        assert len(graph.roads) + int(lost[1] if lost else 0) == len(root)
+        if element.tag == "road" or lost:
+            assert "links of roads to a road or junction that is not there: 2" in told

@@ -172,6 +172,26 @@ def test_comments_may_precede_the_xml_declaration(tmp_path, name, before, encodi
 
 
 @pytest.mark.parametrize("name", ["opendrive", "lanelet2"])
+def test_a_document_type_is_refused_in_any_encoding(tmp_path, name):
+    """Without its byte order mark, UTF-16 is still XML."""
+    path = globals()[f"written_{name}"](tmp_path)
+    text = (
+        f"<?xml version='1.0' encoding='utf-16'?><!DOCTYPE a [<!ENTITY b 'c'>]>{path.read_text()}"
+    )
+    path.write_bytes(text.encode("utf-16-le"))
+    with pytest.raises(MapError, match="document type"):
+        read_map(path)
+
+
+@pytest.mark.parametrize("name", ["opendrive", "lanelet2"])
+def test_suffixes_may_be_upper_case(tmp_path, name):
+    path = globals()[f"written_{name}"](tmp_path)
+    path = path.rename(path.with_suffix(path.suffix.upper()))
+    path.write_text("<!--" + " " * 5000 + "-->" + path.read_text())
+    assert read_map(path).lanes
+
+
+@pytest.mark.parametrize("name", ["opendrive", "lanelet2"])
 @pytest.mark.parametrize("prefix", ["", "m:"])
 def test_xml_namespaces_are_ignored(tmp_path, name, prefix):
     """Elements of another namespace are not read as parts of the map."""
@@ -397,8 +417,9 @@ def test_an_unreadable_speed_limit_is_noted(from_map, sign):
 
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_lanelets_without_a_boundary_are_noted(from_map, side):
-    lanes, figures, told = from_map(lanelet(1) + lanelet(2, [side]) + lanelet(3, [side]))
-    assert [lane["lane_id"] for lane in lanes] == ["l1"]
+    whole = lanelet(1) + lanelet(4)
+    lanes, figures, told = from_map(whole + lanelet(2, [side]) + lanelet(3, [side]))
+    assert [lane["lane_id"] for lane in lanes] == ["l1", "l4"]
     [note] = figures["notes"]
     assert "lack a rim: 2 (l2, l3)" in note
     assert note in told
@@ -429,3 +450,99 @@ def test_a_real_map_of_argoverse_2_has_no_gaps_and_carries_its_drive(test_data):
     graph = read_map(folder)
     assert len(graph.lanes) == 183
     assert max(graph.gaps.values()) < 0.01
+
+
+def grown(folder, reader, count=4):
+    """The content of a reader's own file with ``count`` copies of what is driven on."""
+    content = json.loads(globals()[f"written_{reader}"](folder).read_text())
+    if reader == "argoverse2":
+        one = json.dumps(content["lane_segments"]["1"])
+        more = {str(k): json.loads(one) | {"id": k} for k in range(10, 10 + count)}
+        content["lane_segments"] |= more
+    else:
+        content["lane"] += [content["lane"][0] | {"token": f"l{k}"} for k in range(count)]
+        paths = content["arcline_path_3"]
+        paths |= {f"l{k}": json.loads(json.dumps(paths["l"])) for k in range(count)}
+    return content
+
+
+def change(content, place, value):
+    """Set a value in nested containers, or remove it (None)."""
+    for name in place[:-1]:
+        content = content[int(name) if isinstance(content, list) else name]
+    last = int(place[-1]) if isinstance(content, list) else place[-1]
+    if value is None:
+        content.pop(last, None)
+    else:
+        content[last] = value
+
+
+@pytest.mark.parametrize(
+    ("reader", "place", "value", "note"),
+    [
+        ("argoverse2", "lane_segments 10 left_lane_boundary", [], "10: has no length"),
+        ("argoverse2", "lane_segments 10 left_lane_boundary 0 x", math.nan, "10: its borders"),
+        ("argoverse2", "lane_segments 10 lane_type", None, "lane segments .*10: lacks 'lane_type'"),
+        ("argoverse2", "lane_segments 10 left_neighbor_id", 77, "not in the file: .*10 to 77"),
+        ("argoverse2", "drivable_areas 7 area_boundary", None, "areas .*7: lacks 'area_boundary'"),
+        ("argoverse2", "pedestrian_crossings 8 edge1", "x", "crossings .*8: TypeError"),
+        ("argoverse2", "drivable_areas", [], "not objects: 1 .drivable_areas"),
+        ("nuscenes", "stop_line", {}, "not lists: 1 .stop_line"),
+        ("nuscenes", "lane 1 polygon_token", "gone", r"3.5 m, because they have no .*\(l0\)"),
+        ("nuscenes", "arcline_path_3 l0 0 radius", "x", "lanes left out .*l0: ValueError"),
+        ("nuscenes", "arcline_path_3 l0", [], "lanes left out .*l0: has no arcline_path_3"),
+        ("nuscenes", "lane 1", 7, "lanes left out .*row 1: TypeError"),
+        ("nuscenes", "lane 1 token", "l", r"lanes left out .* twice: 1 \(l\)"),
+        ("nuscenes", "node 0 x", None, "polygons left out .*p: lacks 'a'"),
+        ("nuscenes", "stop_line 0 polygon_token", "gone", "stop lines .*w: has no polygon 'gone'"),
+        ("nuscenes", "traffic_light 0 pose", {}, "signals left out .*t: lacks 'tx'"),
+    ],
+)
+def test_a_damaged_record_is_left_out_and_told(tmp_path, reader, place, value, note):
+    """The other lanes are those of the file without the damage."""
+    content, graph = grown(tmp_path, reader), {}
+    path = tmp_path / "log_map_archive_x.json"
+    for name in ("whole", "damaged"):
+        path.write_text(json.dumps(content))
+        graph[name] = read_map(path, format=reader)
+        change(content, place.split(), value)
+    assert any(re.search(note, told) for told in graph["damaged"].notes), graph["damaged"].notes
+    assert len(graph["whole"].lanes) - len(graph["damaged"].lanes) <= 1
+    for key, lane in graph["damaged"].lanes.items():
+        assert np.array_equal(lane.centre, graph["whole"].lane(key).centre)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "lost", "note"),
+    [
+        ('<tag k="local_x" v="0"/>', '<tag k="local_x" v="x"/>', ["l1"], "nodes .*local_x is 'x'"),
+        ('<tag k="local_x" v="0"/>', "", ["l1"], r"nodes .* lack local_x and local_y: 1 \(100\)"),
+        ('<nd ref="100"/>', "", ["l1"], r"lack a rim: 1 \(l1\)"),
+        ('<tag k="local_x" v="40"/>', '<tag k="local_x" v="9e8"/>', ["l1"], "l1: its borders are"),
+        ('<way id="10">', '<way id="20">', ["l1"], r"ways left out .* twice: 1 \(20\)"),
+        ('<relation id="l2">', '<relation id="l1">', ["l2"], r"relations .* twice: 1 \(l1\)"),
+    ],
+)
+def test_a_damaged_lanelet_costs_no_other(tmp_path, old, new, lost, note):
+    osm = lanelet(1) + lanelet(2) + lanelet(3)
+    whole, graph = read_osm(tmp_path, osm), read_osm(tmp_path, osm.replace(old, new, 1))
+    assert sorted(set(whole.lanes) - set(graph.lanes)) == lost
+    assert any(re.search(note, told) for told in graph.notes), graph.notes
+
+
+def test_ways_that_do_not_continue_a_border_are_noted(tmp_path):
+    graph = read_osm(tmp_path, lanelet(1, ("left", "right", "left")) + lanelet(4))
+    assert graph.notes == ("ways left out because they do not continue a border: 1 (12)",)
+
+
+@pytest.mark.parametrize(
+    ("sign", "speed"),
+    [
+        ("usR2-1-35", 35 * 0.44704), ("US:R2-1[35]", 35 * 0.44704), ("DE:274[60]", 60 / 3.6),
+        ("FR:B14[50]", 50 / 3.6), ("GB:670[V30]", 30 * 0.44704), ("30 MPH", 30 * 0.44704),
+    ],
+)  # fmt: skip
+def test_signs_of_other_notations_give_their_limit(tmp_path, sign, speed):
+    graph = read_osm(tmp_path, limited_by(sign))
+    assert graph.lane("l1").speed_limit == pytest.approx(speed)
+    assert graph.notes == ()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 
 from real2sim_proto.storyboard import Storyboard, resolved, story_actions
@@ -107,6 +109,85 @@ def test_catalogs_and_distributions_are_read_from_their_folders(tmp_path):
     assert found.cases == ({"braking": 2.0}, {"braking": 6.0})
     assert found.board.parameters["braking"] == 2.0
     assert found.board.entities[0].model == "ego"
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "encoding"),
+    [
+        ("<", "<", "utf-8-sig"),
+        ("<", "<", "utf-16"),
+        ("<", "<", "utf-16-le"),
+        ("\n", "\r\n", "utf-8"),
+        ("<?xml", "\n<!-- by hand -->\n<?xml", "utf-8"),
+        ("<OpenSCENARIO", '<OpenSCENARIO xmlns="http://example.org/osc"', "utf-8"),
+        ("<OpenSCENARIO", '<s:OpenSCENARIO xmlns:s="http://example.org/osc"', "utf-8"),
+    ],
+)
+def test_encodings_line_ends_and_namespaces_make_no_difference(before, after, encoding):
+    text = CASE.replace(before, after)
+    if "<s:" in after:
+        text = re.sub(r"<(/?)(?=[A-Z])", r"<\1s:", text)
+    declared = "utf-8" if encoding.startswith("utf-8") else "utf-16"
+    text = re.sub("encoding='[^']*'", f"encoding='{declared}'", text)
+    found = read_openscenario_text(text.encode(encoding), "case.xosc")
+    assert found.board == read(CASE)
+
+
+def test_lines_count_from_the_first_line_of_the_file():
+    text = "\n<!-- by hand -->\n" + CASE.replace("dynamicsShape=", 'wobble="2" dynamicsShape=', 1)
+    with pytest.raises(ScenarioError, match=f"line {line_of(text, 'wobble')}: attribute wobble"):
+        read(text)
+
+
+def with_catalogs(folder, path, text=CASE):
+    """The case with its car in a catalog, and a road network; ``path`` names their folder."""
+    vehicle = CASE[CASE.index("<Vehicle ") : CASE.index("</Vehicle>") + len("</Vehicle>")]
+    header = CASE[CASE.index("<FileHeader") : CASE.index("/>", CASE.index("<FileHeader")) + 2]
+    (folder / "Data").mkdir()
+    (folder / "Data" / "road.xodr").touch()
+    (folder / "Data" / "cars.XOSC").write_text(
+        f'<OpenSCENARIO>{header}<Catalog name="cars">{vehicle}</Catalog></OpenSCENARIO>'
+    )
+    text = text.replace(vehicle, '<CatalogReference catalogName="cars" entryName="ego" />')
+    text = text.replace(
+        "<CatalogLocations />",
+        f'<CatalogLocations><VehicleCatalog><Directory path="{path}" /></VehicleCatalog>'
+        "</CatalogLocations>",
+    ).replace(
+        "<RoadNetwork />", f'<RoadNetwork><LogicFile filepath="{path}/road.xodr" /></RoadNetwork>'
+    )
+    (folder / "cases").mkdir()
+    (folder / "cases" / "case.XOSC").write_text(text)
+    return folder / "cases" / "case.XOSC"
+
+
+@pytest.mark.parametrize("path", ["../Data", r"..\Data", r".\..\Data", "../data"])
+def test_paths_may_have_backslashes_and_names_of_another_case(tmp_path, path):
+    found = read_openscenario(with_catalogs(tmp_path, path))
+    assert found.road_file == (tmp_path / "Data" / "road.xodr").resolve()
+    assert found.board.entities[0].model == "ego"
+    assert any("differs in case" in note for note in found.notes) == ("data" in path)
+
+
+def test_names_that_fit_several_files_are_not_guessed(tmp_path):
+    file = with_catalogs(tmp_path, "../data")
+    (tmp_path / "DATA").mkdir()
+    if len(list(tmp_path.glob("[Dd]*"))) < 2:
+        pytest.skip("the file system ignores case")
+    with pytest.raises(ScenarioError, match=f"{tmp_path.resolve()}/data is not a folder"):
+        read_openscenario(file)
+
+
+def test_a_damaged_catalog_costs_no_other(tmp_path):
+    file = with_catalogs(tmp_path, "../Data")
+    (tmp_path / "Data" / "bikes.xosc").write_text("<OpenSCENARIO>")
+    found = read_openscenario(file)
+    assert found.board.entities[0].model == "ego"
+    [note] = [note for note in found.notes if "catalog is left out" in note]
+    assert "bikes.xosc: is not an XML file" in note
+    (tmp_path / "Data" / "cars.XOSC").unlink()
+    with pytest.raises(ScenarioError, match=r"no catalog has the Vehicle cars/ego.*bikes.xosc"):
+        read_openscenario(file)
 
 
 def test_files_from_another_program_mean_the_same(tmp_path):

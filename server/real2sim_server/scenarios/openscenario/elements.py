@@ -14,6 +14,7 @@ from typing import Any
 
 from real2sim_proto.storyboard_values import evaluated
 
+from ..._files import xml_data
 from .. import ScenarioError
 
 MAX_BYTES, MAX_ELEMENTS, MAX_DEPTH = 64 << 20, 1_000_000, 200
@@ -327,12 +328,20 @@ def read_elements(data: bytes, file: str, leave_out: frozenset[str] = frozenset(
         file: name in messages.
         leave_out: names of elements to remove before anything is read.
 
+    The prefix of the root's namespace is removed from all names.
+
     Raises:
         ScenarioError: too large, too deep, not XML, or with a document type.
     """
     if len(data) > MAX_BYTES:
         raise ScenarioError(f"{file}: is larger than {MAX_BYTES >> 20} MiB, the most that is read")
     builder = _Builder(file)
+    try:
+        data = xml_data(data)
+    except ValueError as error:
+        raise ScenarioError(f"{file}: {error}") from error
+    except (xml.parsers.expat.ExpatError, LookupError) as error:
+        raise ScenarioError(f"{file}: is not an XML file ({error})") from error
     try:
         builder.parser.Parse(data, True)
     except ScenarioError:
@@ -368,13 +377,11 @@ def _acts(raw: RawElement) -> bool:
 
 class _Builder:
     def __init__(self, file: str) -> None:
-        self._file, self._open, self._count = file, list[RawElement](), 0
+        self._file, self._open, self._count, self._prefix = file, list[RawElement](), 0, ""
         self.root: RawElement | None = None
         self.parser = xml.parsers.expat.ParserCreate()
         self.parser.StartElementHandler = self._start
         self.parser.EndElementHandler = self._end
-        self.parser.StartDoctypeDeclHandler = self._doctype
-        self.parser.EntityDeclHandler = self._doctype
 
     def _start(self, tag: str, attributes: dict[str, str]) -> None:
         self._count += 1
@@ -383,6 +390,9 @@ class _Builder:
                 f"{self._file}: more than {MAX_ELEMENTS} elements, or nested deeper than "
                 f"{MAX_DEPTH}"
             )
+        if not self._open:
+            self._prefix = tag[: tag.rfind(":") + 1]
+        tag = tag.removeprefix(self._prefix)
         made = RawElement(tag, self.parser.CurrentLineNumber, attributes)
         if self._open:
             self._open[-1].children.append(made)
@@ -392,10 +402,6 @@ class _Builder:
 
     def _end(self, _tag: str) -> None:
         self._open.pop()
-
-    def _doctype(self, *_: Any) -> None:
-        # Entities could expand a small file until it fills the memory; scenarios do not need them.
-        raise ScenarioError(f"{self._file}: declares a document type or entities")
 
 
 # --- Names ---------------------------------------------------------------------------------------

@@ -57,6 +57,24 @@ KINDS = {
 MAX_FILES = 1000
 
 
+def located(folder: Path, given: str, part: Part) -> Path:
+    """The absolute path of a file or folder that an element names, with ``/`` or ``\\``.
+
+    A name of another case is noted and read if it is the only one that fits.
+    """
+    given = given.replace("\\", "/")
+    path = Path("/") if given.startswith("/") else folder
+    for name in given.split("/"):
+        path = path.resolve().parent if name == ".." else path / name
+        if path.exists() or not path.parent.is_dir():
+            continue
+        alike = [p for p in path.parent.iterdir() if p.name.lower() == name.lower()]
+        if len(alike) == 1:
+            path = alike[0]
+            part.notes.add(f"{given!r} is read as {path}, which differs in case")
+    return path.resolve()
+
+
 class Catalogs:
     """Catalog entries by catalog and name, from the folders named in a scenario.
 
@@ -69,6 +87,7 @@ class Catalogs:
         self._folder, self._leave_out = folder, leave_out
         self._entries: dict[tuple[str, str, str], tuple[RawElement, str]] = {}
         self.used: list[tuple[RawElement, str]] = []
+        self._unread: list[str] = []
 
     def read(self, part: Part) -> None:
         """The files of ``CatalogLocations``. Raises ScenarioError."""
@@ -77,7 +96,7 @@ class Catalogs:
                 raise location.refused(KINDS)
             path = location.child("Directory").text("path")
             for file in self._files(location, path):
-                self._read_file(file)
+                self._read_file(file, part.notes)
 
     def entry(self, part: Part, kind: str) -> Part:
         """The entry that a ``CatalogReference`` names, with its parameters assigned."""
@@ -90,7 +109,10 @@ class Catalogs:
         if found is None:
             known = sorted(f"{c}/{n}" for k, c, n in self._entries if k == kind)
             there = ", ".join(known) or "none"
-            raise part.error(f"no catalog has the {kind} {catalog}/{name}; there are: {there}")
+            lacking = f" ({'; '.join(self._unread)})" if self._unread else ""
+            raise part.error(
+                f"no catalog has the {kind} {catalog}/{name}; there are: {there}{lacking}"
+            )
         raw, file = found
         self.used.append(found)
         raw.is_read = True
@@ -110,20 +132,27 @@ class Catalogs:
         if self._folder is None:
             part.ignore(f"the file came without its catalogs {path!r}")
             return []
-        folder = (self._folder / path.replace("\\", "/")).resolve()
+        folder = located(self._folder, path, part)
         if not folder.is_dir():
-            part.ignore(f"there is no catalog folder {path!r} next to the scenario file")
+            part.ignore(f"there is no catalog folder {folder}")
+            self._unread.append(f"{folder} is not a folder")
             return []
-        files = sorted(folder.glob("*.xosc"))
+        files = sorted(f for f in folder.iterdir() if f.suffix.lower() == ".xosc")
         if len(files) > MAX_FILES:
             raise part.error(f"folder {path!r} holds more than {MAX_FILES} catalogs")
         return files
 
-    def _read_file(self, file: Path) -> None:
+    def _read_file(self, file: Path, notes: Notes) -> None:
+        """The entries of a file; one that cannot be read costs no other catalog."""
         try:
             root = read_elements(file.read_bytes(), file.name, self._leave_out)
-        except OSError as error:
-            raise ScenarioError(f"{file.name}: cannot be read ({error.strerror})") from error
+        except (OSError, ScenarioError) as error:
+            reason = f"{file}: {error.strerror}" if isinstance(error, OSError) else str(error)
+            if notes.strict:
+                raise ScenarioError(reason) from error
+            notes.add(f"a catalog is left out because it cannot be read: {reason}")
+            self._unread.append(reason)
+            return
         for catalog in (c for c in root.children if c.tag == "Catalog"):
             name = catalog.attributes.get("name", "")
             for raw in catalog.children:
@@ -289,7 +318,7 @@ def read_openscenario(path: Path, options: ReadOptions | None = None) -> Scenari
     target = distribution.child("ScenarioFile").text("filepath")
     cases, drawn = read_distributions(distribution)
     _refuse_unread(root, path.name)
-    found = _first_allowed(path.parent / target, cases, options)
+    found = _first_allowed(located(path.parent.resolve(), target, distribution), cases, options)
     board = found.board
     if drawn:
         fields = board.model_dump() | {"distributions": drawn}
@@ -467,9 +496,9 @@ class _Reader:
         if logic is not None:
             name = logic.text("filepath")
             if name:
-                name = name.replace("\\", "/")
-                fields["roads"] = {"kind": "map", "file": name}
-                self.road_file = (self._folder / name).resolve() if self._folder else None
+                fields["roads"] = {"kind": "map", "file": name.replace("\\", "/")}
+                if self._folder is not None:
+                    self.road_file = located(self._folder, name, logic)
         signals = part.find("TrafficSignals")
         if signals is None:
             return fields
@@ -552,12 +581,13 @@ class _Reader:
         )
 
     def _of_catalog(self, part: Part) -> Part:
+        errors = []
         for kind in ("Vehicle", "Pedestrian", "MiscObject"):
             try:
                 return self.catalogs.entry(part, kind)
             except ScenarioError as error:
-                last = error
-        raise last
+                errors.append(error)
+        raise errors[0]
 
     def _object_controllers(self, part: Part, name: str, ego: str | None) -> None:
         for each in part.children("ObjectController"):
