@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +13,14 @@ from typer.testing import CliRunner
 
 import real2sim
 from real2sim.planners import FollowRoute, run_episode
+from real2sim_server.logs import write_native_log
+from real2sim_server.reconstruct import ReconstructOptions, reconstruct
+from real2sim_server.reconstruct.training.schedule import preset
 from real2sim_server.scene import Scene
-from real2sim_server.scene.io import save_scene
+from real2sim_server.scene.io import load_scene, save_scene
 from real2sim_server.service.serve import RunningWorker, running_worker
 from real2sim_server.settings import Settings
+from real2sim_server.synthetic import SyntheticConfig, generate_log
 
 pytestmark = pytest.mark.network
 
@@ -112,3 +117,30 @@ def test_the_drive_command_leaves_figures(worker, tmp_path: Path):
     result = CliRunner().invoke(build_app(), [*command, "--json", str(figures)])
     assert result.exit_code == 0, result.output
     assert json.loads(figures.read_text())["steps"] == 3
+
+
+def test_a_log_that_lacks_images_is_reconstructed_edited_and_driven(
+    tmp_path: Path, worker_kernels: None
+) -> None:
+    small = SyntheticConfig(frames=10, width=48, height=32, moving_cars=1, parked_cars=2,
+                            lidar_beams=12, lidar_columns=120)  # fmt: skip
+    log = write_native_log(generate_log(small), tmp_path / "log")
+    for frame in (0, 5):
+        (log / f"images/front/{frame:06d}.png").unlink()
+    training = replace(preset("cpu-small"), iterations=6, width=48)
+    report = reconstruct(log, tmp_path / "scenes/gaps", ReconstructOptions(training=training))
+    assert report.left_out == {"images": 2}
+    left_out = load_scene(tmp_path / "scenes/gaps").provenance["left_out"]["images"]
+    assert left_out["count"] == 2
+    assert "images/front/000000.png: cannot be read" in left_out["first"][0]
+    settings = Settings(data_dir=tmp_path / "data", scenes_dir=tmp_path / "scenes", port=0,
+                        backend="cpu", log_level="error")  # fmt: skip
+    with (
+        running_worker(settings) as running,
+        real2sim.connect(running.url, token=running.token) as sim,
+    ):
+        scenario = sim.scenarios.create(scene="gaps")
+        scenario.objects[min(scenario.objects)].delete()
+        with sim.session(scenario=scenario.scenario_id) as session:
+            summary = run_episode(session, FollowRoute(speed=5.0), steps=5, sensors=["front"])
+    assert summary.steps == 5
