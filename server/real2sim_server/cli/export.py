@@ -396,6 +396,7 @@ def export_dataset(
             "files": len(files),
             "bytes": sum(file["bytes"] for file in files),
             "boxes": manifest["statistics"]["boxes"],
+            "of other categories": manifest["statistics"]["boxes_of_other_categories"],
             "licence": manifest["licence"],
         }
     print_figures(f"data set of {loaded.name}", figures)
