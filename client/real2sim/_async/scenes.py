@@ -373,8 +373,8 @@ class AsyncAssets(AsyncCollection[AssetInfo]):
             asset_id: default: the file's name.
             category: category, such as ``car``, ``truck`` or ``pedestrian``.
             up_axis: axis of the file that points up: ``z``, ``y`` or ``-y``; default: as declared
-                in the file (spz and exported ply), else ``-y``. ``provenance["up_axis"]`` of the
-                asset reports it.
+                in the file (spz and exported ply), else ``z``. The asset's ``provenance`` has the
+                axis, and in ``notes`` what was left out of the file.
             yaw: rotation about z after that [rad], to align the front with x.
             length: real length [m]; default: typical for the category.
 

@@ -14,7 +14,6 @@ import typer
 from ..console import (
     CommandError,
     console,
-    errors,
     print_figures,
     refuse_existing,
     staged_progress,
@@ -80,7 +79,7 @@ def import_(
 ) -> None:
     """Convert a splat file or checkpoint of another system to a scene, or splats to an asset."""
     refuse_existing(out, overwrite=overwrite)
-    if file.suffix == CHECKPOINT_SUFFIX:
+    if file.suffix.lower() == CHECKPOINT_SUFFIX:
         figures = _import_checkpoint(file, out, dataset, frames, overwrite=overwrite)
     elif up_axis not in (None, *get_args(UpAxis)):
         raise CommandError(f"--up-axis {up_axis!r}; allowed are {', '.join(get_args(UpAxis))}")
@@ -90,8 +89,11 @@ def import_(
         )
     else:
         figures = _import_scene(file, out, cast("UpAxis | None", up_axis), overwrite=overwrite)
+    notes = figures.pop("notes", ())
     print_figures(f"imported {file.name}", figures)
-    write_json(json, figures)
+    write_json(json, figures | {"notes": notes})
+    for note in notes:
+        console.print(f"note: {note}", soft_wrap=True, markup=False)
 
 
 def _import_checkpoint(
@@ -101,28 +103,26 @@ def _import_checkpoint(
     frames: tuple[int, int] | None,
     *,
     overwrite: bool,
-) -> dict[str, object]:
+) -> dict[str, Any]:
     from ..reconstruct.imports import CheckpointOptions, import_checkpoint
     from ..scene.io import save_scene
 
     first, last = frames or (0, None)
     options = CheckpointOptions(dataset=dataset, first_frame=first, last_frame=last, name=out.name)
     imported = import_checkpoint(file, options)
-    for warning in imported.warnings:
-        errors.print(f"[yellow]warning:[/] {warning}", highlight=False, soft_wrap=True)
     scene = save_scene(imported.scene, out, overwrite=overwrite)
     return {
         "scene": str(out),
         "objects": len(scene.objects),
         "gaussians": scene.gaussian_count,
         "content_hash": scene.content_hash,
-        "warnings": list(imported.warnings),
+        "notes": list(imported.warnings),
     }
 
 
 def _import_asset(
     file: Path, out: Path, category: str, up_axis: UpAxis | None, *, overwrite: bool
-) -> dict[str, object]:
+) -> dict[str, Any]:
     from ..scene.io import import_splats, save_asset
 
     asset = import_splats(file, name=out.name, as_asset=True, category=category, up_axis=up_axis)
@@ -133,12 +133,13 @@ def _import_asset(
         "gaussians": len(asset.cloud),
         "size_m": " x ".join(f"{edge:.2f}" for edge in asset.size),
         "content_hash": asset.content_hash,
+        "notes": asset.provenance["notes"],
     }
 
 
 def _import_scene(
     file: Path, out: Path, up_axis: UpAxis | None, *, overwrite: bool
-) -> dict[str, object]:
+) -> dict[str, Any]:
     from ..scene.io import import_splats, save_scene
 
     scene = import_splats(file, name=out.name, up_axis=up_axis)
@@ -148,6 +149,7 @@ def _import_scene(
         "up_axis": scene.provenance["up_axis"],
         "gaussians": scene.gaussian_count,
         "content_hash": scene.content_hash,
+        "notes": scene.provenance["notes"],
     }
 
 

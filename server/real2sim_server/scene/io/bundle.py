@@ -61,7 +61,7 @@ from .document import (
     unpack_lanes,
 )
 from .splat_format import UpAxis
-from .splats import import_splats, up_axis_of
+from .splats import import_splats
 
 BACKGROUND_FILE = "background.safetensors"
 OBJECTS_FILE = "objects.safetensors"
@@ -652,8 +652,7 @@ def read_and_save_asset(
         name=asset_id,
         as_asset=True,
         category=category,
-        # Most files without axes come from trainers with cameras that look along z.
-        up_axis=up_axis or up_axis_of(source) or "-y",
+        up_axis=up_axis,
         yaw=yaw,
         max_bytes=max_bytes,
     )
