@@ -52,8 +52,8 @@ def import_(
     file: Annotated[
         Path,
         typer.Argument(
-            help="Splats (.ply, .compressed.ply, .spz, .splat) or a checkpoint (.pth) of Street "
-            "Gaussians or drivestudio."
+            help="Splats (.ply, .compressed.ply, .spz, .splat), a folder of `real2sim export`, or "
+            "a checkpoint (.pth) of Street Gaussians or drivestudio."
         ),
     ],
     out: Annotated[Path, typer.Option("--out", help="Bundle to write.")],
@@ -140,9 +140,14 @@ def _import_asset(
 def _import_scene(
     file: Path, out: Path, up_axis: UpAxis | None, *, overwrite: bool
 ) -> dict[str, Any]:
-    from ..scene.io import import_splats, save_scene
+    from ..scene.io import import_exported, import_splats, save_scene
 
-    scene = import_splats(file, name=out.name, up_axis=up_axis)
+    if file.is_dir():
+        if up_axis is not None:
+            raise CommandError("--up-axis is for splat files; objects.json states it for a folder")
+        scene = import_exported(file, name=out.name)
+    else:
+        scene = import_splats(file, name=out.name, up_axis=up_axis)
     scene = save_scene(scene, out, overwrite=overwrite)
     return {
         "scene": str(out),
@@ -181,11 +186,11 @@ def export(
     Formats: one file per object, the whole scene baked at a time, animated glTF, or plain points
     (one .ply, or a folder with the background and each object).
     """
-    from ..scene.io import export_scene, load_scene
+    from ..scene.io import export_scene, open_scene
     from ..scene.io.splats import FORMATS
 
     refuse_existing(out, overwrite=overwrite)
-    loaded = load_scene(scene)
+    loaded = open_scene(scene)
     if file_format == "points":
         files = _write_points(loaded, out, t_us, objects)
         _tell(scene, loaded.gaussian_count, files, "z", json)
@@ -328,7 +333,7 @@ def export_dataset(
     from ..datasets.export import export_dataset as export
     from ..datasets.plan import ExportPlan, read_rig
     from ..executors import executor_of
-    from ..scene.io import load_scene
+    from ..scene.io import open_scene
 
     backend = chosen_backend(backend, device)
     plan = ExportPlan(
@@ -359,7 +364,7 @@ def export_dataset(
         seed=seed,
     )
     variants, made_of = _swept(
-        load_scene(scene),
+        open_scene(scene),
         operations=operations,
         episode=episode,
         assets=assets,
@@ -409,9 +414,9 @@ def export_dataset(
 
 def _variants(path: Path, **options: Any) -> list[Variant]:
     """Recreate the exported drives in a separate process."""
-    from ..scene.io import load_scene
+    from ..scene.io import open_scene
 
-    return _swept(load_scene(path), **options)[0]
+    return _swept(open_scene(path), **options)[0]
 
 
 def _swept(

@@ -29,6 +29,7 @@ from .common import (
     RenderDevice,
     SceneBundle,
     SequenceName,
+    changed_bundle,
     chosen_backend,
     command,
     log_selection,
@@ -181,7 +182,7 @@ def evaluate(
     """Compare a scene with its log: images, moving objects, LiDAR depth, rendering speed."""
     from ..logs.open import open_log
     from ..reconstruct.evaluation import EvaluateOptions, evaluate_scene, write_report
-    from ..scene.io import load_scene
+    from ..scene.io import open_scene
 
     options = EvaluateOptions(
         frames=_parse_frames(frames),
@@ -191,7 +192,7 @@ def evaluate(
         around=around,
         lidar=lidar,
     )
-    loaded, opened = load_scene(scene), open_log(log, format=log_format, sequence=sequence)
+    loaded, opened = open_scene(scene), open_log(log, format=log_format, sequence=sequence)
     with staged_progress() as on_progress:
         result = evaluate_scene(loaded, opened, options=options, on_progress=on_progress)
     print_figures(f"{scene.name} against {opened.name}", _table(result))
@@ -317,14 +318,14 @@ def fit_scene(
 ) -> None:
     """Fit ``what`` of a scene, write the bundle and print the figures."""
     from ..logs import open_log, same_part
-    from ..scene.io import load_scene, save_scene
+    from ..scene.io import open_scene, save_scene
 
-    scene = load_scene(files.scene)
+    target = changed_bundle(files.scene, files.out)
+    scene = open_scene(files.scene)
     opened = open_log(files.log, format=files.log_format, sequence=files.sequence)
     log = same_part(opened, scene.provenance)
     with staged_progress() as on_progress:
         made, fitted = fit(scene, log, on_progress)
-    target = files.scene if files.out is None else files.out
     save_scene(made, target, overwrite=files.out is None)
     figures = {"scene": str(target), **fitted}
     print_figures(f"{target.name}, {what}", figures)
@@ -357,13 +358,13 @@ def fit_lidar(
     from dataclasses import asdict
 
     from ..reconstruct.lidar import fit_lidar_surfaces
-    from ..scene.io import load_scene
+    from ..scene.io import open_scene
 
     def fit(loaded: Scene, opened: DrivingLog, on_progress: Callable[..., None]) -> Fitted:
         made, report = fit_lidar_surfaces(
             loaded,
             opened,
-            surfaces=load_scene(surfaces) if surfaces else None,
+            surfaces=open_scene(surfaces) if surfaces else None,
             steps=steps,
             on_progress=on_progress,
         )

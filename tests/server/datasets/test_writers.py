@@ -22,7 +22,7 @@ from typer.testing import CliRunner
 from real2sim.cli import build_app
 from real2sim_server.datasets.writers import WRITERS
 from real2sim_server.datasets.writers.categories import CATEGORIES
-from real2sim_server.logs import open_log
+from real2sim_server.logs import LogError, open_log
 from real2sim_server.scene.io import save_scene
 
 FRAMES, CAMERAS = 5, 2
@@ -55,6 +55,23 @@ def open_first_clip(exported: Path, folder: str, sequence: str | None):
         poses = next(exported.glob("waymo/*/vehicle_pose/*_0000.parquet"))
         return open_log(poses.parents[1], sequence=poses.stem)
     return open_log(exported / folder, sequence=sequence)
+
+
+@pytest.mark.parametrize(
+    ("folder", "sequence"),
+    [
+        ("kitti", "0000"),
+        ("kitti_raw", "2011_09_26_drive_0000_sync"),
+        ("nuscenes", "scene-0000"),
+    ],
+)
+def test_the_folder_of_a_format_is_opened_as_a_log(exported, folder, sequence):
+    assert open_log(exported / folder, sequence=sequence).frame_count > 1
+
+
+def test_a_data_set_with_several_formats_lists_its_logs(exported):
+    with pytest.raises(LogError, match=r"open one of these folders: .*kitti/tracking \(kitti\)"):
+        open_log(exported)
 
 
 def boxes_of_log(log, t_us: int):

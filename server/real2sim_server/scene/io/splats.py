@@ -211,7 +211,7 @@ def import_splats(
     up_axis = up_axis or stated or "z"
     if not len(cloud):
         raise BundleError(f"{file}: holds no splats; nothing to import")
-    placed = _within_reach(cloud.moved(upright(up_axis, yaw), scale=scale), file, notes)
+    placed = within_reach(cloud.moved(upright(up_axis, yaw), scale=scale), file, notes)
     provenance = {
         "source": "splat file",
         "file": file.name,
@@ -226,7 +226,7 @@ def import_splats(
     return scene_from_cloud(placed, name=name, provenance=provenance)
 
 
-def _within_reach(cloud: GaussianCloud, file: Path, notes: list[str]) -> GaussianCloud:
+def within_reach(cloud: GaussianCloud, file: Path, notes: list[str]) -> GaussianCloud:
     """``cloud`` [m] without splats that are too far away or too wide for float32."""
     far = (cloud.means.abs() > MAX_REACH).any(dim=1)
     wide = (cloud.scales > MAX_REACH).any(dim=1)
@@ -257,11 +257,17 @@ def asset_from_cloud(
     return Asset(name, category, (length, width, height), cloud.moved(to_centre), provenance)
 
 
-def scene_from_cloud(cloud: GaussianCloud, *, name: str, provenance: dict[str, Any]) -> Scene:
+def scene_from_cloud(
+    cloud: GaussianCloud,
+    *,
+    name: str,
+    provenance: dict[str, Any],
+    times_us: tuple[int, int] = (0, VIEW_DURATION_US),
+) -> Scene:
     """A scene with ``cloud`` as background, seen along x by one camera that covers its robust box.
 
-    The ego is stationary behind the box for ten seconds. Its camera ``front`` looks at the box's
-    centre.
+    The ego is stationary behind the box during ``times_us``. Its camera ``front`` looks at the
+    centre of the box.
     """
     low, high = robust_bounds(cloud)
     centre, extent = (low + high) / 2, np.maximum(high - low, 1e-3)
@@ -278,7 +284,7 @@ def scene_from_cloud(cloud: GaussianCloud, *, name: str, provenance: dict[str, A
         np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]),
         pose,
     )
-    times = np.array([0, VIEW_DURATION_US], dtype=np.int64)
+    times = np.array(times_us, dtype=np.int64)
     ego = Trajectory(times, np.array([position] * 2), np.array([[1.0, 0, 0, 0]] * 2))
     return Scene(name, cloud, {}, None, CameraRig((camera,)), ego, times, provenance=provenance)
 
