@@ -14,11 +14,12 @@ import numpy as np
 from real2sim.planners import load_planner
 from real2sim_server.console import print_figures, staged_progress
 from real2sim_server.scene import Scene
+from real2sim_server.scene.io import open_scene
 from real2sim_server.sweeps.episode import drive_episode, recording_of
 from real2sim_server.sweeps.evaluation import Evaluation, Evaluator
 from real2sim_server.sweeps.optimise import SearchBudget, SearchState, random_search, search
 from real2sim_server.sweeps.search import wilson
-from real2sim_server.sweeps.spec import load_space, open_scene
+from real2sim_server.sweeps.spec import load_space
 from real2sim_server.world import warm_up
 from real2sim_server.world.recording import first_difference
 

@@ -226,8 +226,10 @@ def scene_splats(scene: str, params: Mapping[str, str]) -> Call[bytes]:
     return Call(request, lambda reply: reply.content)
 
 
-def object_splats(scenario_id: str, object_id: str, t_us: int | None) -> Call[bytes]:
-    params = {"object_id": object_id} | ({} if t_us is None else {"t_us": str(t_us)})
+def object_splats(scenario_id: str, object_id: str, t_us: int | None, up_axis: str) -> Call[bytes]:
+    params = {"object_id": object_id, "up_axis": up_axis} | (
+        {} if t_us is None else {"t_us": str(t_us)}
+    )
     request = Request("GET", f"{_scenario(scenario_id)}/splats", params, long_timeout=True)
     return Call(request, lambda reply: reply.content)
 

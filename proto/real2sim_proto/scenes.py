@@ -290,7 +290,7 @@ class AssetUpload(Model):
         default=None,
         description=(
             "up axis of the file; default: as stated by the file (y for spz; the header of "
-            "an exported ply), otherwise -y"
+            "an exported ply), otherwise z"
         ),
     )
     yaw: float = Field(

@@ -45,7 +45,7 @@ from .render import (
 )
 from .render.images import to_uint8
 from .scene import Camera, Scene
-from .scene.io import load_scene, read_packed
+from .scene.io import open_scene, read_packed
 from .world.batch import BatchWorld
 from .world.path import WAYPOINTS
 
@@ -352,7 +352,7 @@ class VectorDriveEnv(VectorEnv[Arrays, NDArray[np.float32], Arrays]):
 def _scene(scene: Scene | str | Path | None) -> Scene:
     if isinstance(scene, Scene):
         return scene
-    return read_packed(SHIPPED) if scene is None else load_scene(Path(scene))
+    return read_packed(SHIPPED) if scene is None else open_scene(scene)
 
 
 def _commands(actions: ArrayLike, worlds: int) -> NDArray[np.float64]:

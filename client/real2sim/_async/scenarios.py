@@ -467,15 +467,22 @@ class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
         return Path(path)
 
     async def splats(
-        self, object_id: str, *, t: float | None = None, t_us: int | None = None
+        self,
+        object_id: str,
+        *,
+        t: float | None = None,
+        t_us: int | None = None,
+        up_axis: str = "y",
     ) -> bytes:
-        """The current Gaussians of an object as an spz file (version 3, z up), in the frame of its
-        box, sorted by decreasing coverage.
+        """The current Gaussians of an object as an spz file (version 3), in the frame of its box,
+        sorted by decreasing coverage.
 
         Args:
             object_id: object of the scenario.
             t, t_us: time that sets the pose of a walking person, in seconds or in microseconds;
                 default: the start.
+            up_axis: axis that points up in the file: ``y`` as in all spz files, ``z`` for the axes
+                of the box, or ``-y``.
 
         Raises:
             NotFoundError: no such object.
@@ -485,7 +492,8 @@ class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
             >>> gzip.decompress(await scenario.splats("post"))[:4]
             b'NGSP'
         """
-        call = _requests.object_splats(self.scenario_id, object_id, instant_us(t, t_us))
+        instant = instant_us(t, t_us)
+        call = _requests.object_splats(self.scenario_id, object_id, instant, up_axis)
         return await self._transport.send(call)
 
     async def undo(self, count: int = 1) -> OperationResult:

@@ -89,14 +89,17 @@ class AsyncScenes(AsyncCollection[SceneInfo]):
         object_id: str | None = None,
         first: int = 0,
         count: int = 32_768,
+        up_axis: str = "y",
     ) -> bytes:
-        """Gaussians as an spz file (version 3, z up), sorted by decreasing coverage.
+        """Gaussians as an spz file (version 3), sorted by decreasing coverage.
 
         Args:
             scene: a scene or its name.
             object_id: object, in the frame of its box; default: the background, in the world frame.
             first: number of Gaussians to skip from the start.
             count: maximum number, up to 262144; past the end the file is empty.
+            up_axis: axis that points up in the file: ``y`` as in all spz files, ``z`` for the axes
+                of the scene, or ``-y``.
 
         Raises:
             NotFoundError: no such scene or object.
@@ -106,7 +109,7 @@ class AsyncScenes(AsyncCollection[SceneInfo]):
             >>> gzip.decompress(await client.scenes.splats("street", object_id="car_red"))[:4]
             b'NGSP'
         """
-        params = {"first": str(first), "count": str(count)}
+        params = {"first": str(first), "count": str(count), "up_axis": up_axis}
         params |= {} if object_id is None else {"object_id": object_id}
         return await self._transport.send(_requests.scene_splats(scene_name(scene), params))
 
@@ -373,8 +376,8 @@ class AsyncAssets(AsyncCollection[AssetInfo]):
             asset_id: default: the file's name.
             category: category, such as ``car``, ``truck`` or ``pedestrian``.
             up_axis: axis of the file that points up: ``z``, ``y`` or ``-y``; default: as declared
-                in the file (spz and exported ply), else ``-y``. ``provenance["up_axis"]`` of the
-                asset reports it.
+                in the file (spz and exported ply), else ``z``. The asset's ``provenance`` has the
+                axis, and in ``notes`` what was left out of the file.
             yaw: rotation about z after that [rad], to align the front with x.
             length: real length [m]; default: typical for the category.
 

@@ -45,7 +45,9 @@ JsonFile = Annotated[
     Path | None,
     typer.Option("--json", help="Also write the results to this JSON file.", dir_okay=False),
 ]
-SceneBundle = Annotated[Path, typer.Argument(help="Scene bundle.")]
+SceneBundle = Annotated[
+    Path, typer.Argument(help="Scene bundle, packed scene (.r2s.zip) or demo_street.")
+]
 LogFolder = Annotated[Path, typer.Argument(help="Folder of a driving log.")]
 LogFormat = Annotated[
     str | None, typer.Option("--format", help="Format of the log; default: detected.")
@@ -75,6 +77,19 @@ RenderBackend = Annotated[str, typer.Option(help="Renderer: auto, cpu, cuda or r
 RenderDevice = Annotated[
     str | None, typer.Option(help="Device: cpu, cuda, cuda:1, ...; default: the renderer's.")
 ]
+
+
+def changed_bundle(scene: Path, out: Path | None) -> Path:
+    """The bundle that a command writes: ``out``, by default the scene itself.
+
+    Raises:
+        CommandError: the scene is not a bundle.
+    """
+    if out is None and not scene.is_dir():
+        raise CommandError(
+            f"{scene} is not a bundle that can be changed; name a new one with --out"
+        )
+    return scene if out is None else out
 
 
 def log_selection(frames: str, cameras: str | None, every: int) -> LogSelection:

@@ -103,8 +103,8 @@ def run(
 
     from ..scenarios.flat_scene import fitted_to_scene
     from ..scenarios.openscenario import ReadOptions
+    from ..scene.io import open_scene
     from ..sweeps.episode import recording_of
-    from ..sweeps.spec import open_scene
     from ..world.recording import save_recording
 
     options = ReadOptions(_parameters(values or []), frozenset(leave_out or ()), ego, strict)
@@ -438,7 +438,7 @@ def replay(
 
 
 def _load_its_scene(recording: Recording, name: str, folder: Path | None) -> Scene:
-    from ..sweeps.spec import open_scene
+    from ..scene.io import open_scene
 
     scene = open_scene(name, folder)
     if scene.content_hash != recording.scene_hash:

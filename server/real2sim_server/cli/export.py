@@ -14,7 +14,6 @@ import typer
 from ..console import (
     CommandError,
     console,
-    errors,
     print_figures,
     refuse_existing,
     staged_progress,
@@ -53,8 +52,8 @@ def import_(
     file: Annotated[
         Path,
         typer.Argument(
-            help="Splats (.ply, .compressed.ply, .spz, .splat) or a checkpoint (.pth) of Street "
-            "Gaussians or drivestudio."
+            help="Splats (.ply, .compressed.ply, .spz, .splat), a folder of `real2sim export`, or "
+            "a checkpoint (.pth) of Street Gaussians or drivestudio."
         ),
     ],
     out: Annotated[Path, typer.Option("--out", help="Bundle to write.")],
@@ -80,7 +79,7 @@ def import_(
 ) -> None:
     """Convert a splat file or checkpoint of another system to a scene, or splats to an asset."""
     refuse_existing(out, overwrite=overwrite)
-    if file.suffix == CHECKPOINT_SUFFIX:
+    if file.suffix.lower() == CHECKPOINT_SUFFIX:
         figures = _import_checkpoint(file, out, dataset, frames, overwrite=overwrite)
     elif up_axis not in (None, *get_args(UpAxis)):
         raise CommandError(f"--up-axis {up_axis!r}; allowed are {', '.join(get_args(UpAxis))}")
@@ -90,8 +89,11 @@ def import_(
         )
     else:
         figures = _import_scene(file, out, cast("UpAxis | None", up_axis), overwrite=overwrite)
+    notes = figures.pop("notes", ())
     print_figures(f"imported {file.name}", figures)
-    write_json(json, figures)
+    write_json(json, figures | {"notes": notes})
+    for note in notes:
+        console.print(f"note: {note}", soft_wrap=True, markup=False)
 
 
 def _import_checkpoint(
@@ -101,28 +103,26 @@ def _import_checkpoint(
     frames: tuple[int, int] | None,
     *,
     overwrite: bool,
-) -> dict[str, object]:
+) -> dict[str, Any]:
     from ..reconstruct.imports import CheckpointOptions, import_checkpoint
     from ..scene.io import save_scene
 
     first, last = frames or (0, None)
     options = CheckpointOptions(dataset=dataset, first_frame=first, last_frame=last, name=out.name)
     imported = import_checkpoint(file, options)
-    for warning in imported.warnings:
-        errors.print(f"[yellow]warning:[/] {warning}", highlight=False, soft_wrap=True)
     scene = save_scene(imported.scene, out, overwrite=overwrite)
     return {
         "scene": str(out),
         "objects": len(scene.objects),
         "gaussians": scene.gaussian_count,
         "content_hash": scene.content_hash,
-        "warnings": list(imported.warnings),
+        "notes": list(imported.warnings),
     }
 
 
 def _import_asset(
     file: Path, out: Path, category: str, up_axis: UpAxis | None, *, overwrite: bool
-) -> dict[str, object]:
+) -> dict[str, Any]:
     from ..scene.io import import_splats, save_asset
 
     asset = import_splats(file, name=out.name, as_asset=True, category=category, up_axis=up_axis)
@@ -133,21 +133,28 @@ def _import_asset(
         "gaussians": len(asset.cloud),
         "size_m": " x ".join(f"{edge:.2f}" for edge in asset.size),
         "content_hash": asset.content_hash,
+        "notes": asset.provenance["notes"],
     }
 
 
 def _import_scene(
     file: Path, out: Path, up_axis: UpAxis | None, *, overwrite: bool
-) -> dict[str, object]:
-    from ..scene.io import import_splats, save_scene
+) -> dict[str, Any]:
+    from ..scene.io import import_exported, import_splats, save_scene
 
-    scene = import_splats(file, name=out.name, up_axis=up_axis)
+    if file.is_dir():
+        if up_axis is not None:
+            raise CommandError("--up-axis is for splat files; objects.json states it for a folder")
+        scene = import_exported(file, name=out.name)
+    else:
+        scene = import_splats(file, name=out.name, up_axis=up_axis)
     scene = save_scene(scene, out, overwrite=overwrite)
     return {
         "scene": str(out),
         "up_axis": scene.provenance["up_axis"],
         "gaussians": scene.gaussian_count,
         "content_hash": scene.content_hash,
+        "notes": scene.provenance["notes"],
     }
 
 
@@ -179,11 +186,11 @@ def export(
     Formats: one file per object, the whole scene baked at a time, animated glTF, or plain points
     (one .ply, or a folder with the background and each object).
     """
-    from ..scene.io import export_scene, load_scene
+    from ..scene.io import export_scene, open_scene
     from ..scene.io.splats import FORMATS
 
     refuse_existing(out, overwrite=overwrite)
-    loaded = load_scene(scene)
+    loaded = open_scene(scene)
     if file_format == "points":
         files = _write_points(loaded, out, t_us, objects)
         _tell(scene, loaded.gaussian_count, files, "z", json)
@@ -326,7 +333,7 @@ def export_dataset(
     from ..datasets.export import export_dataset as export
     from ..datasets.plan import ExportPlan, read_rig
     from ..executors import executor_of
-    from ..scene.io import load_scene
+    from ..scene.io import open_scene
 
     backend = chosen_backend(backend, device)
     plan = ExportPlan(
@@ -357,7 +364,7 @@ def export_dataset(
         seed=seed,
     )
     variants, made_of = _swept(
-        load_scene(scene),
+        open_scene(scene),
         operations=operations,
         episode=episode,
         assets=assets,
@@ -396,6 +403,7 @@ def export_dataset(
             "files": len(files),
             "bytes": sum(file["bytes"] for file in files),
             "boxes": manifest["statistics"]["boxes"],
+            "of other categories": manifest["statistics"]["boxes_of_other_categories"],
             "licence": manifest["licence"],
         }
     print_figures(f"data set of {loaded.name}", figures)
@@ -406,9 +414,9 @@ def export_dataset(
 
 def _variants(path: Path, **options: Any) -> list[Variant]:
     """Recreate the exported drives in a separate process."""
-    from ..scene.io import load_scene
+    from ..scene.io import open_scene
 
-    return _swept(load_scene(path), **options)[0]
+    return _swept(open_scene(path), **options)[0]
 
 
 def _swept(

@@ -81,14 +81,14 @@ def simulate(
 ) -> None:
     """Simulate collisions and deformation of a scene's objects; write film and curves."""
     from ..edit.state import ScenarioState
-    from ..scene.io import load_scene
+    from ..scene.io import open_scene
     from ..simulation.experiments import FilmPlan, draw_curves, set_up, views, write_film
     from ..simulation.result import Playback
     from ..simulation.rollout import simulate
     from ..simulation.spawn import EGO, with_ego
 
     values = values_of(physics or [])
-    loaded = load_scene(scene)
+    loaded = open_scene(scene)
     state: PlacedObjects = ScenarioState.of(loaded)
     taking_part = tuple(objects or ())
     if EGO in taking_part:
@@ -284,11 +284,11 @@ def calibrate(
     Reports the uncertainty of each parameter, from the observations and from the cell size.
     """
     from ..edit.state import ScenarioState
-    from ..scene.io import load_scene
+    from ..scene.io import open_scene
     from ..simulation.calibration import calibrate_object, observations_of
 
     given = _read(observed)
-    loaded = load_scene(scene)
+    loaded = open_scene(scene)
     state = ScenarioState.of(loaded)
     taking_part = (subject, *(beside or ()))
     setup = continue_driving(loaded, state, taking_part, frame, preset=preset)

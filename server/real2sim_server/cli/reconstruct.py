@@ -30,6 +30,7 @@ from .common import (
     SceneBundle,
     SequenceName,
     Strict,
+    changed_bundle,
     chosen_backend,
     command,
     log_selection,
@@ -186,7 +187,7 @@ def evaluate(
 ) -> None:
     """Compare a scene with its log: images, moving objects, LiDAR depth, rendering speed."""
     from ..reconstruct.evaluation import EvaluateOptions, evaluate_scene, write_report
-    from ..scene.io import load_scene
+    from ..scene.io import open_scene
 
     options = EvaluateOptions(
         frames=_parse_frames(frames),
@@ -196,7 +197,7 @@ def evaluate(
         around=around,
         lidar=lidar,
     )
-    loaded = load_scene(scene)
+    loaded = open_scene(scene)
     opened = opened_log(log, log_format, sequence, provenance=loaded.provenance)
     with staged_progress() as on_progress:
         result = evaluate_scene(loaded, opened, options=options, on_progress=on_progress)
@@ -322,13 +323,13 @@ def fit_scene(
     files: FitFiles, what: str, fit: Callable[[Scene, DrivingLog, Callable[..., None]], Fitted]
 ) -> None:
     """Fit ``what`` of a scene, write the bundle and print the figures."""
-    from ..scene.io import load_scene, save_scene
+    from ..scene.io import open_scene, save_scene
 
-    scene = load_scene(files.scene)
+    target = changed_bundle(files.scene, files.out)
+    scene = open_scene(files.scene)
     log = opened_log(files.log, files.log_format, files.sequence, provenance=scene.provenance)
     with staged_progress() as on_progress:
         made, fitted = fit(scene, log, on_progress)
-    target = files.scene if files.out is None else files.out
     save_scene(made, target, overwrite=files.out is None)
     figures = {"scene": str(target), **fitted}
     print_figures(f"{target.name}, {what}", figures)
@@ -361,13 +362,13 @@ def fit_lidar(
     from dataclasses import asdict
 
     from ..reconstruct.lidar import fit_lidar_surfaces
-    from ..scene.io import load_scene
+    from ..scene.io import open_scene
 
     def fit(loaded: Scene, opened: DrivingLog, on_progress: Callable[..., None]) -> Fitted:
         made, report = fit_lidar_surfaces(
             loaded,
             opened,
-            surfaces=load_scene(surfaces) if surfaces else None,
+            surfaces=open_scene(surfaces) if surfaces else None,
             steps=steps,
             on_progress=on_progress,
         )

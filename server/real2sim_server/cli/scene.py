@@ -18,6 +18,7 @@ from .common import (
     RenderDevice,
     SceneBundle,
     SequenceName,
+    changed_bundle,
     chosen_backend,
     command,
     opened_log,
@@ -70,7 +71,7 @@ def render(
     """
     from ..edit.compose import instances_at
     from ..render import render_cameras, warm_up
-    from ..scene.io import load_scene
+    from ..scene.io import open_scene
 
     if log is not None and (t_us is not None or delete):
         raise CommandError("--log compares whole recorded frames: use --frame, and no --delete")
@@ -82,7 +83,7 @@ def render(
     _check_output(out, modality)
     backend = chosen_backend(backend, device)
     warm_up(backend)  # Keeps warm-up out of the printed render time.
-    loaded = load_scene(scene)
+    loaded = open_scene(scene)
     time_us = _frame_time(loaded, frame or 0) if t_us is None else t_us
     chosen = loaded.rig[camera] if camera else loaded.rig.cameras[0]
     [picture] = render_cameras(
@@ -128,12 +129,12 @@ def _render_sweep(
     from ..render.cast import detect, sensor_poses
     from ..render.cast.call import select_caster
     from ..render.cast.files import SUFFIXES, write_sweep
-    from ..scene.io import load_scene
+    from ..scene.io import open_scene
     from ..scene.range_sensors import find_lidar
 
     if out.suffix.lower() not in SUFFIXES:
         raise CommandError(f"--out {out}: the name must end in {', '.join(SUFFIXES)}")
-    sensor, loaded = find_lidar(lidar), load_scene(scene)
+    sensor, loaded = find_lidar(lidar), open_scene(scene)
     time_us = _frame_time(loaded, moment.frame or 0) if moment.t_us is None else moment.t_us
     loaded.ego.pose(time_us)
     met = sweep_of(loaded, _without(loaded, delete), sensor, time_us)
@@ -232,7 +233,7 @@ def film(
 ) -> None:
     """Render film.mp4 and strip.png of a finished simulation again."""
     from ..edit.state import ScenarioState
-    from ..scene.io import load_scene
+    from ..scene.io import open_scene
     from ..simulation.experiments import FilmPlan, views, write_film
     from ..simulation.result import PlacedObjects, Playback, SimulationResult
     from ..simulation.spawn import EGO, with_ego
@@ -242,7 +243,7 @@ def film(
         raise CommandError(f"--view {view!r}; allowed are {', '.join(names)}")
     backend = chosen_backend(backend, device)
     plan, result = FilmPlan.load(run), SimulationResult.load(run / "simulation")
-    loaded = load_scene(scene)
+    loaded = open_scene(scene)
     state: PlacedObjects = ScenarioState.of(loaded)
     if EGO in result.objects:
         loaded, state = with_ego(loaded, state)
@@ -284,9 +285,9 @@ def ground(
 ) -> None:
     """Compare the ground below a scene's objects with RANSAC planes of LiDAR and Gaussians."""
     from ..scene.ground_fit import find_road_plane, ground_points
-    from ..scene.io import load_scene
+    from ..scene.io import open_scene
 
-    loaded = load_scene(scene)
+    loaded = open_scene(scene)
     if frame >= len(loaded.frame_times_us):
         raise CommandError(f"--frame {frame}; it has 0 to {len(loaded.frame_times_us) - 1}")
     t_us = int(loaded.frame_times_us[frame])
@@ -457,10 +458,10 @@ def map_(
     """Show the lanes of a scene, or add lanes from a map or the log."""
     from dataclasses import replace
 
-    from ..scene.io import load_scene, save_scene
+    from ..scene.io import open_scene, save_scene
     from ..scene.io.document import lane_document
 
-    loaded = load_scene(scene)
+    loaded = open_scene(scene)
     figures: dict[str, Any] = {"scene": str(scene)}
     lanes = loaded.lanes
     if source is not None:
@@ -473,7 +474,7 @@ def map_(
         out.write_text(lane_document(lanes).model_dump_json(), encoding="utf-8")
         figures["document"] = str(out)
     elif source is not None or out is not None:
-        target = out or scene
+        target = changed_bundle(scene, out)
         save_scene(replace(loaded, lanes=lanes), target, overwrite=out is None)
         figures["scene"] = str(target)
     print_figures(f"lanes of {scene.name}", figures)

@@ -24,6 +24,7 @@ from .labels import HOW
 from .labels.points import ROOF
 from .plan import ExportPlan, PlannedClip, Variant, planned_cameras, planned_lidar, planned_shards
 from .writers import LabelledDrive, writer_of
+from .writers.categories import written_as_other
 from .writers.plain import labels_sheet
 
 # --- Previews ------------------------------------------------------------------------------------
@@ -327,6 +328,8 @@ def _write_manifest(
     digest: str,
     made_of: Mapping[str, Any],
 ) -> None:
+    statistics = statistics_of(clips)
+    others = {name: written_as_other(name, statistics["boxes"]) for name in plan.formats}
     unmade = "lidar" if planned_lidar(plan) is None else "points"
     files = sorted(p for p in result.rglob("*") if p.is_file() and p != result / MANIFEST)
     content = {
@@ -338,7 +341,8 @@ def _write_manifest(
         "made_of": dict(made_of),
         "plan": {**asdict(plan), "splits": dict(plan.splits)},
         "clips": {clip.name: _clip_row(clip) for clip in clips},
-        "statistics": statistics_of(clips),
+        "statistics": statistics
+        | {"boxes_of_other_categories": {k: v for k, v in others.items() if v}},
         "labels": {k: v for k, v in HOW.items() if k != unmade},
         "provenance": dict(scene.provenance),
         "licence": _licence(scene.provenance),

@@ -18,7 +18,8 @@ def open_log(
     be used are left out, and ``left_out`` of the log lists them.
 
     Args:
-        path: the log's folder.
+        path: the log's folder, or one up to two levels above it that contains no other log, such
+            as the folder of an exported data set.
         format: a reader's name; by default the first reader that recognises the folder.
         sequence: name of a drive in a folder with several; a single one is the default.
 
@@ -28,19 +29,37 @@ def open_log(
     folder = Path(path)
     if not folder.is_dir():
         raise LogError(f"{folder}: no such folder; a log is a folder\n{_known_formats()}")
-    reader = _reader_for(folder, format)
+    folder, reader = _reader_for(folder, format)
     with damage_named(f"{folder} ({reader.name})"):
         log = reader.read(folder, sequence=sequence)
         return leave_out(log, check_log(log, contents=False))
 
 
-def _reader_for(folder: Path, format_name: str | None) -> LogReader:
+def _reader_for(folder: Path, format_name: str | None) -> tuple[Path, LogReader]:
+    """The folder of the log and its reader."""
     for reader in READERS:
         if reader.name == format_name or (format_name is None and reader.recognises(folder)):
-            return reader
+            return folder, reader
     if format_name is not None:
         raise LogError(f"unknown log format {format_name!r}\n{_known_formats()}")
+    found: list[tuple[Path, LogReader]] = []
+    for child in _subfolders(folder):
+        below = _recognised(child) or [one for c in _subfolders(child) for one in _recognised(c)]
+        found += below
+    if len(found) == 1:
+        return found[0]
+    if found:
+        names = ", ".join(f"{path.relative_to(folder)} ({reader.name})" for path, reader in found)
+        raise LogError(f"{folder}: contains several logs; open one of these folders: {names}")
     raise LogError(f"{folder}: not a log of any known format\n{_known_formats()}")
+
+
+def _subfolders(folder: Path) -> list[Path]:
+    return sorted(child for child in folder.iterdir() if child.is_dir())
+
+
+def _recognised(folder: Path) -> list[tuple[Path, LogReader]]:
+    return [(folder, reader) for reader in READERS if reader.recognises(folder)][:1]
 
 
 def _known_formats() -> str:

@@ -19,13 +19,14 @@ from .._files import atomic_file
 from ..console import CommandError
 from ..policies.page import film_episode
 from ..scene import Scene
+from ..scene.io import open_scene
 from ..world.recording import first_difference, save_recording
 from .episode import CameraFeed, Driven, drive_episode, recording_of
 from .evaluation import REFUSED, Evaluation, Evaluator, drive_reference
 from .failure import Failure, boundaries, render_page, write_scenario
 from .optimise import SearchBudget, SearchState, search
 from .parameters import drawn_parameters
-from .spec import Space, open_scene
+from .spec import Space
 from .sweep import open_journal
 
 # --- Statistics ----------------------------------------------------------------------------------

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import json
 import math
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,7 +28,6 @@ from real2sim_proto.sweeps import SpreadMethod, StopRule, with_kinds
 
 from .._files import atomic_file
 from ..console import CommandError
-from ..demo.street import unpack_street
 from ..policies.suite import Case
 from ..scenarios import ScenarioError
 from ..scenarios.flat_scene import fitted_to_scene
@@ -43,7 +41,7 @@ from ..scenarios.openscenario import (
 )
 from ..scene import Scene
 from ..scene.errors import BundleError
-from ..scene.io import DEMO_SCENE, load_scene
+from ..scene.io import open_scene
 from .parameters import (
     Method,
     Name,
@@ -56,29 +54,6 @@ from .parameters import (
 )
 
 # --- Scenes of storyboards ------------------------------------------------------------------------
-
-
-def open_scene(name: str, folder: Path | None = None) -> Scene:
-    """The bundle with a path, or with a name below a folder; the demo street by default.
-
-    Raises:
-        CommandError: the bundle does not exist.
-        BundleError: the bundle cannot be read.
-    """
-    places = [Path(name), *([folder / name] if folder is not None else [])]
-    for place in places:
-        if place.is_dir():
-            return load_scene(place)
-    if name == DEMO_SCENE:
-        # Use a bundle: recordings store its hash, as on the demo's worker.
-        with tempfile.TemporaryDirectory(prefix="real2sim-street-") as made:
-            unpack_street(Path(made), DEMO_SCENE)
-            return load_scene(Path(made) / DEMO_SCENE)
-    raise CommandError(
-        f"no scene {name!r}; give the path of a bundle, its name below the folder of --scenes, or "
-        f"{DEMO_SCENE}"
-    )
-
 
 GALLERY = "gallery:"
 SECONDS = 15.0

@@ -20,12 +20,13 @@ from .._files import atomic_file
 from ..console import CommandError
 from ..executors import Executor, Recipe
 from ..scene import Scene
+from ..scene.io import open_scene
 from ..world import warm_up
 from ..world.recording import save_recording
 from ..world.scoring import metrics_version
 from .episode import CameraFeed, Drive, Driven, drive_episode, recording_of
 from .parameters import Choice, IntRange, Value, drawn_parameters, points_of, values_at
-from .spec import SweepSpec, open_scene, write_scenario_file
+from .spec import SweepSpec, write_scenario_file
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -193,7 +194,7 @@ COLUMNS: Mapping[str, type] = {
 
 
 def recipe_of(scene: str, scenes: Path | None, metrics: Sequence[str] = ()) -> Recipe:
-    """A factory of workers for a scene; see :func:`.spec.open_scene`."""
+    """A factory of workers for a scene; see :func:`~..scene.io.open_scene`."""
     return partial(EpisodeWorker, scene, scenes, tuple(metrics))
 
 
@@ -201,7 +202,7 @@ class EpisodeWorker:
     """Holds a scene and drives episodes in it.
 
     Args:
-        scene, scenes: as for :func:`.spec.open_scene`.
+        scene, scenes: as for :func:`~..scene.io.open_scene`.
         metrics: scores to add as columns.
         threads: number of threads.
     """

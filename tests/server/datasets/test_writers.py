@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import dataclasses
+import functools
 import json
 import lzma
 import tarfile
@@ -20,7 +21,8 @@ from typer.testing import CliRunner
 
 from real2sim.cli import build_app
 from real2sim_server.datasets.writers import WRITERS
-from real2sim_server.logs import open_log
+from real2sim_server.datasets.writers.categories import CATEGORIES
+from real2sim_server.logs import LogError, open_log
 from real2sim_server.scene.io import save_scene
 
 FRAMES, CAMERAS = 5, 2
@@ -53,6 +55,23 @@ def open_first_clip(exported: Path, folder: str, sequence: str | None):
         poses = next(exported.glob("waymo/*/vehicle_pose/*_0000.parquet"))
         return open_log(poses.parents[1], sequence=poses.stem)
     return open_log(exported / folder, sequence=sequence)
+
+
+@pytest.mark.parametrize(
+    ("folder", "sequence"),
+    [
+        ("kitti", "0000"),
+        ("kitti_raw", "2011_09_26_drive_0000_sync"),
+        ("nuscenes", "scene-0000"),
+    ],
+)
+def test_the_folder_of_a_format_is_opened_as_a_log(exported, folder, sequence):
+    assert open_log(exported / folder, sequence=sequence).frame_count > 1
+
+
+def test_a_data_set_with_several_formats_lists_its_logs(exported):
+    with pytest.raises(LogError, match=r"open one of these folders: .*kitti/tracking \(kitti\)"):
+        open_log(exported)
 
 
 def boxes_of_log(log, t_us: int):
@@ -194,6 +213,7 @@ def exports(tiny_scene, tmp_path_factory):
     """Exports by the command of scenes whose objects have the given categories."""
     folder = tmp_path_factory.mktemp("categories")
 
+    @functools.cache
     def export(*categories: str) -> Path:
         name = "_".join(categories)
         objects = {
@@ -230,9 +250,44 @@ def test_category_ids_do_not_depend_on_which_are_present(exports):
     assert {1, 2, 3, 4, 6, 7, 8} <= set(instances) <= set(panoptic)
     assert all(coco[number - 1] == instances[number] for number in (1, 2, 3, 4, 6, 7, 8))
     assert instances[94] == "cyclist"
-    assert next(number for number, name in instances.items() if name == "kiosk") >= 1000
+    assert (instances[106], "kiosk" in instances.values()) == ("other", False)
     assert len(lidarseg) == 32
     assert (lidarseg["vehicle.car"], lidarseg["flat.driveable_surface"]) == (17, 24)
+
+
+def test_coco_exports_of_different_objects_can_be_merged(exports):
+    """Concatenated annotations are counted right by the categories of either file."""
+    one, other = (
+        json.loads((folder / "coco/annotations/instances_train.json").read_text())
+        for folder in (exports("cyclist", "kiosk", "car"), exports("cyclist", "kiosk"))
+    )
+    assert one["categories"] == other["categories"]
+    names = {row["id"]: row["name"] for row in one["categories"]}
+    merged = one["annotations"] + other["annotations"]
+    assert {"cyclist", "kiosk"} <= {row["category"] for row in merged}
+    for row in merged:
+        wanted = "other" if row["category"] == "kiosk" else row["category"]
+        assert names[row["category_id"]] == wanted
+
+
+def test_the_manifest_counts_boxes_of_categories_that_a_format_lacks(exports):
+    folder = exports("cyclist", "kiosk", "car")
+    statistics = json.loads((folder / "manifest.json").read_text())["statistics"]
+    kiosks = statistics["boxes"]["kiosk"]
+    assert statistics["boxes_of_other_categories"] == {
+        name: {"kiosk": kiosks} for name in ("coco", "nuscenes")
+    }
+
+
+def test_the_table_of_categories_is_documented():
+    page = Path(__file__).parents[3] / "docs" / "datasets.md"
+    rows = [
+        "| "
+        + " | ".join([f"`{name}`", f"{c.coco[0]} {c.coco[1]}", *(str(v or "–") for v in c[1:])])
+        + " |"
+        for name, c in CATEGORIES.items()
+    ]
+    assert "\n".join(rows) in page.read_text(encoding="utf-8")
 
 
 def test_pycocotools_gives_labels_used_as_detections_a_perfect_score(exported):

@@ -23,6 +23,7 @@ from typer.testing import CliRunner
 from real2sim.cli import build_app
 from real2sim_server.console import CommandError
 from real2sim_server.executors import Executor, InProcess, executor_of
+from real2sim_server.scene import BundleError
 from real2sim_server.sweeps import load_sweep, run_sweep
 from real2sim_server.sweeps.episode import signed_gaps
 from real2sim_server.sweeps.sweep import FORMAT, JOURNAL, RECORDINGS, TABLE, Journal
@@ -171,7 +172,7 @@ def test_a_stop_rule_ends_at_the_same_row_whatever_was_driven(alone, scene_folde
 def test_invalid_sweeps_are_refused_before_driving(tmp_path, scene_folder, change, message):
     path = tmp_path / "sweep.yaml"
     path.write_text(yaml.safe_dump(SWEEP | change))
-    with pytest.raises(CommandError, match=message):
+    with pytest.raises((CommandError, BundleError), match=message):
         run_sweep(load_sweep(path), tmp_path / "out", InProcess(), scenes=scene_folder)
     assert not (tmp_path / "out").exists()
 

@@ -23,23 +23,9 @@ from ...render import encode_image
 from ...scene import Camera
 from ..clips import Clip
 from ..labels.points import points_in_boxes
+from .categories import classes_of
 from .nuscenes import FRONT, channels_of
 from .writer import LabelledDrive
-
-CATEGORIES = {
-    "car": "REGULAR_VEHICLE",
-    "van": "REGULAR_VEHICLE",
-    "truck": "BOX_TRUCK",
-    "bus": "BUS",
-    "trailer": "VEHICULAR_TRAILER",
-    "pedestrian": "PEDESTRIAN",
-    "cyclist": "BICYCLIST",
-    "motorcyclist": "MOTORCYCLIST",
-    "bicycle": "BICYCLE",
-    "motorcycle": "MOTORCYCLE",
-    "sign": "SIGN",
-}
-"""Category names; other categories are written unchanged in capitals."""
 
 QUATERNION, POSITION = ("qw", "qx", "qy", "qz"), ("tx_m", "ty_m", "tz_m")
 SIZE = ("length_m", "width_m", "height_m")
@@ -153,7 +139,7 @@ def _write_sweep(path: Path, clip: Clip, frame: int) -> None:
 
 
 def _category(category: str) -> str:
-    return CATEGORIES.get(category, category.upper())
+    return classes_of(category).argoverse2 or category.upper()
 
 
 def _pose_columns(poses: Float) -> dict[str, Any]:

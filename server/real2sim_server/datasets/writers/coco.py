@@ -7,7 +7,6 @@ masks run-length encoded column by column.
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -20,20 +19,8 @@ from real2sim_proto.conventions import SEMANTIC_CLASSES, UNLABELED
 from ...body.model import KEYPOINTS
 from ...render import encode_image
 from ..labels.views import without_blobs
+from .categories import CATEGORIES, classes_of
 from .writer import LabelledDrive, objects_of, write_json
-
-CATEGORY_IDS = {
-    "person": 1, "bicycle": 2, "car": 3, "motorcycle": 4, "bus": 6, "train": 7, "truck": 8,
-    "traffic light": 10, "van": 91, "trailer": 92, "tram": 93, "cyclist": 94, "motorcyclist": 95,
-    "animal": 96, "barrier": 97, "cone": 98, "debris": 99, "pole": 100, "sign": 101,
-    "traffic_sign": 102,
-}  # fmt: skip
-"""Categories of every export. Ids up to 90 are COCO's. All others have an id from 1000 on,
-derived from their name.
-"""
-
-COCO_NAMES = {"pedestrian": "person", "traffic_light": "traffic light"}
-"""COCO's name by category, if they differ."""
 
 STUFF_FROM = 200
 """Offset of background categories; the semantic class is added."""
@@ -94,12 +81,6 @@ class CocoWriter:
             split.write(folder, drive)
 
 
-def category_of(category: str) -> tuple[int, str]:
-    """Id and name in COCO of a category of objects, the same in every export."""
-    name = COCO_NAMES.get(category, category)
-    return CATEGORY_IDS.get(name) or 1000 + zlib.crc32(name.encode()) % (1 << 30), name
-
-
 class _Split:
     """Collected annotations of a split."""
 
@@ -109,7 +90,6 @@ class _Split:
         self.annotations: list[dict[str, Any]] = []
         self.keypoints: dict[int, list[tuple[float, float, int]]] = {}
         self.panoptic: list[dict[str, Any]] = []
-        self.categories = {number: name for name, number in CATEGORY_IDS.items()}
 
     def add_image(
         self, stem: str, size: Mapping[str, int], frame: Mapping[str, Any], camera: str, clip: str
@@ -141,12 +121,14 @@ class _Split:
             if "keypoints_2d" in view:
                 self.keypoints[len(self.annotations) + 1] = view["keypoints_2d"]
             left, top, right, bottom = view["box_2d_modal"]
+            category = objects[view["object_id"]]["category"]
             mask = without_blobs(instance == view["instance_id"])
             self.annotations.append(
                 {
                     "id": len(self.annotations) + 1,
                     "image_id": image_id,
-                    "category_id": self._category(objects[view["object_id"]]["category"]),
+                    "category_id": classes_of(category).coco[0],
+                    "category": category,
                     "bbox": [left, top, right - left, bottom - top],
                     "area": int(mask.sum()),
                     "iscrowd": 0,
@@ -175,7 +157,7 @@ class _Split:
             if own.any():
                 segment = INSTANCES_FROM + subject["instance_id"]
                 ids[own] = segment
-                category[segment] = self._category(subject["category"])
+                category[segment] = classes_of(subject["category"]).coco[0]
         segments = [
             _segment(ids == segment, segment, category[segment])
             for segment in np.unique(ids).tolist()
@@ -189,18 +171,13 @@ class _Split:
             {"image_id": image_id, "file_name": f"{stem}.png", "segments_info": segments}
         )
 
-    def _category(self, category: str) -> int:
-        number, name = category_of(category)
-        self.categories[number] = name
-        return number
-
     def write(self, folder: Path, drive: LabelledDrive) -> None:
         info = {"description": drive.name, "version": "1.0"}
         licences = [{"id": 1, "name": drive.licence, "url": ""}]
         images = [{**image, "license": 1} for image in self.images]
         objects = [
             {"id": number, "name": name, "supercategory": "object"}
-            for number, name in sorted(self.categories.items())
+            for number, name in sorted({row.coco for row in CATEGORIES.values()})
         ]
         common = {"info": info, "licenses": licences, "images": images}
         write_json(

@@ -18,18 +18,11 @@ from ...logs.readers.common import compensate_sweep
 from ...scene import Camera
 from ...scene.camera import T_VEHICLE_OPTICAL
 from ..clips import Clip
+from .categories import classes_of
 from .writer import LabelledDrive, objects_of, write_json
 
-CLASSES = {
-    "car": "Car",
-    "van": "Van",
-    "truck": "Truck",
-    "bus": "Truck",
-    "pedestrian": "Pedestrian",
-    "cyclist": "Cyclist",
-    "tram": "Tram",
-}
-"""Class by category; all others are ``Misc``."""
+MISC = "Misc"
+"""Type of categories without one of KITTI's."""
 
 OCCLUDED = (0.85, 0.45)
 """Minimum visibility of fully (0) and partly (1) visible objects; below it is 2."""
@@ -147,7 +140,7 @@ def _columns(row: Mapping[str, Any]) -> str:
     pixels = [-1.0] * 4 if box is None else [max(edge - 0.5, 0.0) for edge in box]
     occluded = sum(row["visibility"] < least for least in OCCLUDED)
     values = [alpha, *pixels, height, width, length, x, y + height / 2, z, heading]
-    kind = CLASSES.get(row["category"], "Misc")
+    kind = classes_of(row["category"]).kitti or MISC
     return f"{kind} {row['truncation']:.6f} {occluded} {numbers(values)}"
 
 
@@ -338,7 +331,7 @@ def _runs(clip: Clip) -> Iterator[list[tuple[int, Mapping[str, Any]]]]:
 def _tracklet(run: Sequence[tuple[int, Mapping[str, Any]]], to_velo: Float) -> Iterator[str]:
     first, subject = run[0]
     length, width, height = subject["size"]
-    kind = CLASSES.get(subject["category"], "Misc")
+    kind = classes_of(subject["category"]).kitti or MISC
     yield "<item>"
     yield f"<objectType>{escape(kind)}</objectType>"
     yield f"<h>{height!r}</h><w>{width!r}</w><l>{length!r}</l><first_frame>{first}</first_frame>"

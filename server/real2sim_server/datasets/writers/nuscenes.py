@@ -21,34 +21,15 @@ from ...geometry import Float, apply_transform, invert_transform, matrix_to_quat
 from ...render import encode_image
 from ...scene import Camera
 from ..clips import Clip
+from .categories import classes_of
 from .writer import LabelledDrive, objects_of, write_json
 
 VERSION = "v1.0-real2sim"
 KEY_PERIOD_US = 500_000
 QUALITY = 95
 LIDAR, FRONT = "LIDAR_TOP", "CAM_FRONT"
-CATEGORIES = {
-    "car": "vehicle.car",
-    "van": "vehicle.car",
-    "truck": "vehicle.truck",
-    "bus": "vehicle.bus.rigid",
-    "trailer": "vehicle.trailer",
-    "pedestrian": "human.pedestrian.adult",
-    "cyclist": "vehicle.bicycle",
-    "motorcyclist": "vehicle.motorcycle",
-    "motorcycle": "vehicle.motorcycle",
-    "bicycle": "vehicle.bicycle",
-    "animal": "animal",
-    "barrier": "movable_object.barrier",
-    "cone": "movable_object.trafficcone",
-    "trafficcone": "movable_object.trafficcone",
-    "debris": "movable_object.debris",
-    "pushable_pullable": "movable_object.pushable_pullable",
-    "bicycle_rack": "static_object.bicycle_rack",
-}
-"""nuScenes category by category."""
 OTHER = "static.other"
-"""Category of all others. The devkit rejects point classes without a colour."""
+"""Category of objects that nuScenes has none for. The devkit rejects classes without a colour."""
 
 CLASSES = (
     "noise", "animal", "human.pedestrian.adult", "human.pedestrian.child",
@@ -341,7 +322,7 @@ def _npz(labels: NDArray[np.uint16]) -> bytes:
 
 
 def _category(category: str) -> str:
-    return CATEGORIES.get(category, OTHER)
+    return classes_of(category).nuscenes or OTHER
 
 
 def _key_frames(clip: Clip) -> list[int]:

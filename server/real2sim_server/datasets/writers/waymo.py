@@ -50,14 +50,13 @@ from ...scene import Camera
 from ...scene.camera import T_VEHICLE_OPTICAL
 from ..clips import Clip
 from ..drive import DatasetError
+from .categories import classes_of
 from .nuscenes import FRONT as AHEAD
 from .nuscenes import channels_of
 from .writer import LabelledDrive, objects_of
 
 SPLITS = {"train": "training", "val": "validation", "test": "testing"}
-TYPES = {"pedestrian": 2, "sign": 3, "cyclist": 4, "bicycle": 4}
-VEHICLE, UNKNOWN = 1, 0
-VEHICLES = frozenset({"car", "van", "truck", "bus", "trailer", "motorcycle", "motorcyclist"})
+UNKNOWN = 0
 SEGMENT, CAMERA_OBJECT = "key.segment_context_name", "key.camera_object_id"
 CAMERA_BOX = "[CameraBoxComponent]"
 PANOPTIC = "[CameraSegmentationLabelComponent]"
@@ -316,7 +315,7 @@ def _accelerations(clip: Clip, frame: Mapping[str, Any]) -> Float:
 
 def box_type(category: str) -> int:
     """Waymo's type of a box."""
-    return VEHICLE if category in VEHICLES else TYPES.get(category, UNKNOWN)
+    return classes_of(category).waymo or UNKNOWN
 
 
 def _write_camera_boxes(

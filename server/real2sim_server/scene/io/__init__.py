@@ -10,8 +10,8 @@ from .bundle import (
     stage_asset,
     stage_scene,
 )
-from .export import export_scene
-from .packed import DEMO_SCENE, SHIPPED_STREET, read_packed, write_packed
+from .export import export_scene, import_exported
+from .packed import DEMO_SCENE, SHIPPED_STREET, open_scene, read_packed, write_packed
 from .splats import import_splats, read_splats, write_splats
 from .summary import (
     AssetSummary,
@@ -30,9 +30,11 @@ __all__ = [
     "StagingError",
     "StagingLimits",
     "export_scene",
+    "import_exported",
     "import_splats",
     "load_asset",
     "load_scene",
+    "open_scene",
     "read_asset_summary",
     "read_packed",
     "read_scene_summary",

@@ -60,8 +60,9 @@ from .document import (
     pack_lanes,
     unpack_lanes,
 )
+from .export import INDEX_NAME, import_exported
 from .splat_format import UpAxis
-from .splats import import_splats, up_axis_of
+from .splats import import_splats
 
 BACKGROUND_FILE = "background.safetensors"
 OBJECTS_FILE = "objects.safetensors"
@@ -569,7 +570,7 @@ class StagingError(SceneError):
 
 
 def stage_scene(source: Path, folder: Path, *, name: str, limits: StagingLimits) -> None:
-    """Read a bundle or splat file and write it as a new bundle at ``folder``.
+    """Read a bundle, splat file or exported folder and write it as a new bundle at ``folder``.
 
     Raises:
         BundleTooLargeError: it takes more memory than the limits allow.
@@ -621,7 +622,9 @@ def _staged(
 def read_and_save_scene(source: str, folder: str, *, max_bytes: int, name: str) -> None:
     """The confined part of :func:`stage_scene`."""
     file = Path(source)
-    if file.is_dir():
+    if (file / INDEX_NAME).is_file():
+        scene = import_exported(file, name=name, max_bytes=max_bytes)
+    elif file.is_dir():
         scene = load_scene(file)
     else:
         scene = import_splats(file, name=name, max_bytes=max_bytes)
@@ -652,8 +655,7 @@ def read_and_save_asset(
         name=asset_id,
         as_asset=True,
         category=category,
-        # Most files without axes come from trainers with cameras that look along z.
-        up_axis=up_axis or up_axis_of(source) or "-y",
+        up_axis=up_axis,
         yaw=yaw,
         max_bytes=max_bytes,
     )

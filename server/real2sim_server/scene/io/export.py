@@ -10,23 +10,35 @@ import json
 import re
 import struct
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from pydantic import BaseModel, ValidationError
 
 from ..._files import atomic_file, atomic_folder
 from ...geometry import Float, invert_transform, matrix_to_quaternion
 from ..camera import Camera
 from ..cloud import SH_C0, GaussianCloud
-from ..errors import SceneError
+from ..errors import BundleError, SceneError
 from ..scene import Scene, SceneObject
 from ..trajectory import Trajectory
+from .document import Vector3, Vector4
 from .splat_format import UpAxis, host_array
-from .splats import FORMATS, format_to_write, upright, write_splats
+from .splats import (
+    FORMATS,
+    VIEW_DURATION_US,
+    format_to_write,
+    read_splats,
+    scene_from_cloud,
+    upright,
+    within_reach,
+    write_splats,
+)
 
 # Writer of binary glTF 2.0 containers.
 
@@ -507,3 +519,102 @@ def _index(
             for k, o in objects.items()
         ],
     }
+
+
+class _IndexedObject(BaseModel):
+    object_id: str
+    file: str
+    category: str
+    size: Vector3
+    times_us: list[int]
+    positions: list[Vector3]
+    quaternions_wxyz: list[Vector4]
+
+
+class _ObjectIndex(BaseModel):
+    """Content of ``objects.json``."""
+
+    format: Literal["real2sim-objects"]
+    version: Literal[1]
+    scene: str
+    content_hash: str | None
+    T_file_scene: list[Vector4]
+    background: str
+    objects: list[_IndexedObject]
+
+
+def import_exported(path: str | PathLike[str], *, name: str, max_bytes: int | None = None) -> Scene:
+    """Read a folder of :func:`export_scene` as a scene: background, objects and their tracks.
+
+    Args:
+        path: folder with ``objects.json``.
+        name: name of the scene.
+        max_bytes: memory limit of the Gaussians of each file; None for no limit.
+
+    Raises:
+        BundleTooLargeError: the limit is exceeded.
+        BundleError: names the file and the reason.
+        SceneError: the objects are not valid.
+    """
+    folder = Path(path)
+    try:
+        index = _ObjectIndex.model_validate_json((folder / INDEX_NAME).read_bytes())
+    except OSError as error:
+        raise BundleError(
+            f"{folder}: a folder without {INDEX_NAME}; give a splat file, or a folder that "
+            "real2sim export has written"
+        ) from error
+    except ValidationError as error:
+        raise BundleError(f"{folder / INDEX_NAME}: {error}") from error
+    turns = {axis: upright(axis, 0.0) for axis in get_args(UpAxis)}
+    given = np.array(index.T_file_scene)
+    axis = next(
+        (axis for axis, turn in turns.items() if np.array_equal(given, invert_transform(turn))),
+        None,
+    )
+    if axis is None:
+        raise BundleError(f"{folder / INDEX_NAME}: T_file_scene is not the rotation of an up axis")
+    notes: list[str] = []
+
+    def cloud_of(file: str) -> GaussianCloud:
+        if Path(file).name != file:
+            raise BundleError(
+                f"{folder / INDEX_NAME}: {file!r} is not the name of a file beside it"
+            )
+        own: list[str] = []
+        cloud = read_splats(folder / file, max_bytes=max_bytes, notes=own)
+        cloud = within_reach(cloud.moved(turns[axis]), folder / file, own)
+        notes.extend(f"{file}: {sentence}" for sentence in own)
+        return cloud
+
+    background = cloud_of(index.background)
+    if not len(background):
+        raise BundleError(f"{folder / index.background}: holds no splats; nothing to import")
+    objects = {
+        o.object_id: SceneObject(
+            o.object_id,
+            o.category,
+            o.size,
+            cloud_of(o.file),
+            Trajectory(
+                np.array(o.times_us, dtype=np.int64),
+                np.array(o.positions),
+                np.array(o.quaternions_wxyz),
+            ),
+        )
+        for o in index.objects
+    }
+    provenance = {
+        "source": "exported folder",
+        "file": folder.name,
+        "scene": index.scene,
+        "scene_hash": index.content_hash,
+        "up_axis": axis,
+        "notes": notes,
+    }
+    starts = [o.trajectory.start_us for o in objects.values()]
+    ends = [o.trajectory.end_us for o in objects.values()]
+    start = min(starts, default=0)
+    times_us = (start, max([*ends, start + VIEW_DURATION_US]))
+    scene = scene_from_cloud(background, name=name, provenance=provenance, times_us=times_us)
+    return replace(scene, objects=objects)

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import io
 import json
+import tempfile
 import zipfile
 from dataclasses import asdict
 from os import PathLike
@@ -34,6 +35,7 @@ from ..errors import BundleError
 from ..figure import Figure
 from ..ground import Ground
 from ..scene import Scene, SceneObject, Sky
+from .bundle import load_scene, save_scene
 from .document import UNCERTAINTIES, CameraPart, GaitPart, TrajectoryPart
 
 FORMAT, VERSION = "real2sim-packed", 1
@@ -383,3 +385,32 @@ SHIPPED_STREET = Path(__file__).parents[2] / "demo" / "street.r2s.zip"
 
 DEMO_SCENE = "demo_street"
 """Name of the bundled street on a server."""
+
+
+PACKED_SUFFIX = ".r2s.zip"
+
+
+def open_scene(name: str | PathLike[str], folder: Path | None = None) -> Scene:
+    """A scene by path or name: a bundle, a packed scene, or the bundled street.
+
+    Args:
+        name: path of a bundle or packed scene, name of a bundle in ``folder``, or ``DEMO_SCENE``.
+        folder: folder of bundles.
+
+    Raises:
+        BundleError: there is no such scene, or it cannot be read.
+    """
+    for place in (Path(name), *([folder / name] if folder is not None else [])):
+        if place.is_dir():
+            return load_scene(place)
+    file = SHIPPED_STREET if str(name) == DEMO_SCENE else Path(name)
+    if not (file.name.endswith(PACKED_SUFFIX) and file.is_file()):
+        raise BundleError(
+            f"no scene {str(name)!r}; give the path of a bundle (a folder with scene.json) or of a "
+            f"packed scene ({PACKED_SUFFIX}), the name of a bundle in the folder of --scenes, or "
+            f"{DEMO_SCENE}"
+        )
+    # A bundle has the hash that recordings and workers know the scene by.
+    with tempfile.TemporaryDirectory(prefix="real2sim-scene-") as made:
+        save_scene(read_packed(file), Path(made) / "scene")
+        return load_scene(Path(made) / "scene")

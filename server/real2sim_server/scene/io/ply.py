@@ -9,7 +9,8 @@ decompress-ply.ts.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import itertools
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
@@ -29,6 +30,7 @@ from .splat_format import (
     column,
     columns,
     host_array,
+    note,
     require_properties,
 )
 
@@ -56,7 +58,8 @@ _TYPES = {
     "double": "f8",
     "float64": "f8",
 }
-_BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
+ASCII = "ascii"
+_BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", ASCII: "="}
 
 
 @dataclass
@@ -66,12 +69,14 @@ class PlyElement:
     Attributes:
         name: for example ``vertex``.
         count: number of records.
-        properties: NumPy type strings by name, in file order.
+        properties: NumPy type strings by name, in file order, without lists.
+        has_lists: whether a record has lists, so that its length varies.
     """
 
     name: str
     count: int
     properties: dict[str, str] = field(default_factory=dict)
+    has_lists: bool = False
 
     @property
     def dtype(self) -> np.dtype[np.void]:
@@ -91,21 +96,25 @@ class PlyHeader:
     Attributes:
         elements: by name, in file order.
         nbytes: length of the header, the offset of the data.
+        comments: text of the comment lines.
+        is_text: whether the records are lines of text.
     """
 
     elements: Mapping[str, PlyElement]
     nbytes: int
+    comments: tuple[str, ...] = ()
+    is_text: bool = False
 
 
 def read_ply_header(path: Path) -> PlyHeader:
-    """Parse the header of a binary PLY file.
+    """Parse the header of a PLY file.
 
     Raises:
-        BundleError: not a PLY file, ascii, an unknown type, list properties, duplicate names, more
-            than ``MAX_HEADER_LINES``, or no end of the header.
+        BundleError: not a PLY file, an unknown type, duplicate names, more than
+            ``MAX_HEADER_LINES``, or no end of the header.
     """
     with _open(path) as file:
-        lines, nbytes = _header_lines(file.read(MAX_HEADER_BYTES), path)
+        lines, comments, nbytes = _header_lines(file.read(MAX_HEADER_BYTES), path)
     if not lines:
         raise BundleError(f"{path}: ply header has no format line")
     order = _byte_order(lines[0], path)
@@ -122,22 +131,36 @@ def read_ply_header(path: Path) -> PlyHeader:
                 _add_property(current, definition, order, path)
             case _:
                 raise BundleError(f"{path}: ply header line {line[:80]!r} is not understood")
-    return PlyHeader(elements, nbytes)
+    return PlyHeader(elements, nbytes, comments, lines[0].split()[1] == ASCII)
 
 
-def read_ply_elements(path: Path) -> dict[str, NDArray[np.void]]:
-    """All elements of a binary PLY file, each as a memory-mapped record array [count].
+def read_ply_elements(path: Path, notes: list[str] | None = None) -> dict[str, NDArray[np.void]]:
+    """All elements of a PLY file, each as a record array [count].
 
-    The size of the file is compared with the header before anything is read or allocated.
+    Records of binary files are memory-mapped. The size of the file is compared with the header
+    before anything is read or allocated. An element with lists and those after it are left out,
+    with a sentence in ``notes``.
 
     Raises:
-        BundleError: like :func:`read_ply_header`, or header and file size do not match.
+        BundleError: like :func:`read_ply_header`, header and file size do not match, vertices have
+            lists, or without ``notes``, another element has.
     """
     header = read_ply_header(path)
-    _check_size(path, header)
+    elements = list(header.elements.values())
+    for index, element in enumerate(elements):
+        if element.has_lists and element.count:
+            sentence = f"ply element {element.name!r} has list properties"
+            if "vertex" not in [known.name for known in elements[:index]]:
+                raise BundleError(f"{path}: {sentence}, the vertices of a splat file none")
+            note(path, notes, sentence, "it and the elements after it are left out")
+            elements = elements[:index]
+            break
+    _check_size(path, header, elements)
+    if header.is_text:
+        return _text_records(path, header, elements)
     arrays: dict[str, NDArray[np.void]] = {}
     offset = header.nbytes
-    for element in header.elements.values():
+    for element in elements:
         if element.nbytes:
             arrays[element.name] = np.memmap(
                 path, dtype=element.dtype, mode="r", offset=offset, shape=(element.count,)
@@ -148,6 +171,37 @@ def read_ply_elements(path: Path) -> dict[str, NDArray[np.void]]:
     return arrays
 
 
+def _text_records(
+    path: Path, header: PlyHeader, elements: Sequence[PlyElement]
+) -> dict[str, NDArray[np.void]]:
+    arrays: dict[str, NDArray[np.void]] = {}
+    with _open(path) as file:
+        file.seek(header.nbytes)
+        for element in elements:
+            arrays[element.name] = np.empty(element.count, dtype=element.dtype)
+            if not (element.count and element.properties):
+                continue
+            # Lines are taken one by one, since loadtxt reads ahead in files.
+            lines = itertools.islice((line for line in file if line.strip()), element.count)
+            try:
+                rows = np.loadtxt(lines, comments=None, ndmin=2)
+            except ValueError as error:
+                reason = str(error)[:120]
+                raise BundleError(f"{path}: ply element {element.name!r}: {reason}") from error
+            if rows.shape != (element.count, len(element.properties)):
+                raise BundleError(
+                    f"{path}: the header promises {element.count} {element.name} of "
+                    f"{len(element.properties)} values, the file has {len(rows)} of "
+                    f"{rows.shape[1]}; export it again"
+                )
+            with np.errstate(invalid="ignore", over="ignore"):
+                for name, values in zip(element.properties, rows.T, strict=True):
+                    arrays[element.name][name] = values
+        if len(elements) == len(header.elements) and file.read().strip():
+            raise BundleError(f"{path}: longer than its header says; export it again")
+    return arrays
+
+
 def _open(path: Path) -> BinaryIO:
     try:
         return path.open("rb")
@@ -155,9 +209,10 @@ def _open(path: Path) -> BinaryIO:
         raise BundleError(f"{path}: cannot be read: {error.strerror}") from error
 
 
-def _header_lines(head: bytes, path: Path) -> tuple[list[str], int]:
-    """Lines between ``ply`` and ``end_header`` without comments, and the offset of the data."""
+def _header_lines(head: bytes, path: Path) -> tuple[list[str], tuple[str, ...], int]:
+    """Lines between ``ply`` and ``end_header``, comments, and the offset of the data."""
     lines: list[str] = []
+    comments: list[str] = []
     start = 0
     while (end := head.find(b"\n", start)) >= 0:
         line = head[start:end].rstrip(b"\r").decode("latin-1")
@@ -165,8 +220,10 @@ def _header_lines(head: bytes, path: Path) -> tuple[list[str], int]:
             break
         start = end + 1
         if line.strip() == "end_header":
-            return lines, start
-        if line.split()[:1] not in ([], ["ply"], ["comment"], ["obj_info"]):
+            return lines, tuple(comments), start
+        if line.split()[:1] == ["comment"]:
+            comments.append(line.strip().removeprefix("comment").strip())
+        elif line.split()[:1] not in ([], ["ply"], ["obj_info"]):
             lines.append(line)
             if len(lines) > MAX_HEADER_LINES:
                 raise BundleError(
@@ -180,8 +237,6 @@ def _header_lines(head: bytes, path: Path) -> tuple[list[str], int]:
 
 def _byte_order(line: str, path: Path) -> str:
     words = line.split()
-    if words[:2] == ["format", "ascii"]:
-        raise BundleError(f"{path}: ascii ply is not supported; write it as binary_little_endian")
     if words[0] != "format" or words[2:] != ["1.0"] or words[1] not in _BYTE_ORDERS:
         raise BundleError(
             f"{path}: ply header starts with {line[:80]!r}; allowed is 'format' with one of "
@@ -202,10 +257,7 @@ def _add_property(element: PlyElement, definition: list[str], order: str, path: 
     match definition:
         case ["list", *_]:
             # Mesh tools declare an empty face element; it has no data in the file.
-            if element.count:
-                raise BundleError(
-                    f"{path}: ply element {element.name!r} has list properties, a splat file none"
-                )
+            element.has_lists = True
         case [kind, name] if kind in _TYPES:
             if name in element.properties:
                 raise BundleError(f"{path}: ply element {element.name!r} has {name[:80]!r} twice")
@@ -217,12 +269,18 @@ def _add_property(element: PlyElement, definition: list[str], order: str, path: 
             )
 
 
-def _check_size(path: Path, header: PlyHeader) -> None:
-    expected = header.nbytes + sum(e.nbytes for e in header.elements.values())
+def _check_size(path: Path, header: PlyHeader, elements: Sequence[PlyElement]) -> None:
+    """Raise BundleError unless the file has the size of ``elements``, the first of the header."""
+    if header.is_text:
+        # A digit and a separator for each value; the last separator may be missing.
+        expected = header.nbytes - 1 + sum(2 * e.count * len(e.properties) for e in elements)
+    else:
+        expected = header.nbytes + sum(e.nbytes for e in elements)
     actual = path.stat().st_size
-    if actual == expected:
+    is_exact = not header.is_text and len(elements) == len(header.elements)
+    if actual == expected or (actual > expected and not is_exact):
         return
-    counts = ", ".join(f"{e.count} {e.name}" for e in header.elements.values())
+    counts = ", ".join(f"{e.count} {e.name}" for e in elements)
     what = "truncated" if actual < expected else "longer than its header says"
     raise BundleError(
         f"{path}: {what}: the header promises {counts} and needs {expected} bytes, "
@@ -238,6 +296,11 @@ DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 SCALE = ("scale_0", "scale_1", "scale_2")
 ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 
+FILTER = "filter_3D"
+
+COMMENT = "real2sim: opacity is a logit, scale a logarithm"
+"""Comment in the header of own files, because readers guess the meaning in files without it."""
+
 MAX_LOGIT = 40.0
 """Logit for opacities of 0 and 1, which have no finite logit."""
 
@@ -245,7 +308,9 @@ MAX_LOGIT = 40.0
 class InriaPly:
     """One ``vertex`` element; log scales, logit opacities, rotation wxyz, f_rest channel-major.
 
-    Properties may come in any order and number type; normals and unknown ones are skipped.
+    Properties may come in any order and number type; normals and unknown ones are skipped. The
+    ``filter_3D`` of Mip-Splatting is applied. A file in which all opacities are between 0 and 1 and
+    all scales are positive is read as opacities and scales.
     """
 
     name = "INRIA ply"
@@ -257,25 +322,26 @@ class InriaPly:
         """Whether ``head`` belongs to a PLY file; the compressed variant is checked first."""
         return head.startswith((b"ply\n", b"ply\r\n"))
 
-    def read(self, path: Path, *, max_bytes: int | None = None) -> GaussianCloud:
+    def read(
+        self, path: Path, *, max_bytes: int | None = None, notes: list[str] | None = None
+    ) -> GaussianCloud:
         """The Gaussians of a file. Raises BundleError naming the file and the reason."""
-        elements = read_ply_elements(path)
+        elements = read_ply_elements(path, notes)
         vertex = elements.get("vertex")
         names = vertex.dtype.names or () if vertex is not None else None
         require_properties(path, "vertex", names, POSITION + DC + ("opacity",) + SCALE + ROTATION)
         assert vertex is not None
-        rest = _rest_properties(path, vertex)
+        rest = _rest_properties(path, vertex, notes)
         check_memory(path, len(vertex), 1 + len(rest) // 3, max_bytes)
-        logits = column(path, vertex, "opacity", infinite=True)
-        with np.errstate(over="ignore"):
-            opacities = 1 / (1 + np.exp(-logits))
+        opacities, log_scales = _activated(path, vertex, notes)
         return build_cloud(
             path,
-            means=columns(path, vertex, POSITION, np.float32),
-            quats=columns(path, vertex, ROTATION),
-            log_scales=columns(path, vertex, SCALE),
+            means=columns(path, vertex, POSITION, np.float32, notes),
+            quats=columns(path, vertex, ROTATION, notes=notes),
+            log_scales=log_scales,
             opacities=opacities,
-            sh=_spherical_harmonics(path, vertex, rest),
+            sh=_spherical_harmonics(path, vertex, rest, notes),
+            notes=notes,
         )
 
     def write(self, cloud: GaussianCloud, path: Path, *, comment: str = "") -> None:
@@ -309,6 +375,7 @@ def write_inria_ply(cloud: GaussianCloud, path: Path, *, comment: str = "") -> N
     ]
     header = "\n".join(
         ["ply", "format binary_little_endian 1.0"]
+        + [f"comment {COMMENT}"]
         + [f"comment {comment}"] * bool(comment)
         + [f"element vertex {len(cloud)}"]
         + [f"property float {name}" for name in names]
@@ -319,14 +386,68 @@ def write_inria_ply(cloud: GaussianCloud, path: Path, *, comment: str = "") -> N
         file.write(np.concatenate(parts, axis=1).astype("<f4").tobytes())
 
 
+DEGREE_4 = 24
+"""Harmonics past the first of degree 4, for each channel."""
+
+
 def _rest_names(count: int) -> tuple[str, ...]:
     return tuple(f"f_rest_{i}" for i in range(count))
 
 
-def _rest_properties(path: Path, vertex: NDArray[np.void]) -> tuple[str, ...]:
+def _activated(
+    path: Path, vertex: NDArray[np.void], notes: list[str] | None
+) -> tuple[Float, Float]:
+    """Opacities [N] and log scales [N, 3], whichever of the two the file stores."""
+    opacity = column(path, vertex, "opacity", infinite=True, notes=notes)
+    scale = columns(path, vertex, SCALE, notes=notes)
+    # NaN compares as false, so rows with NaN are skipped.
+    is_share = len(vertex) > 0 and not ((opacity < 0) | (opacity > 1)).any()
+    is_length = len(vertex) > 0 and not (scale <= 0).any()
+    if COMMENT in read_ply_header(path).comments:
+        is_share = is_length = False
+    with np.errstate(over="ignore", under="ignore", invalid="ignore", divide="ignore"):
+        if is_share and is_length:
+            note(
+                path,
+                notes,
+                "all opacities are between 0 and 1 and all scales positive",
+                "they are read as they are, not as logits and logarithms",
+            )
+            opacities, log_scales = opacity, np.log(scale)
+        else:
+            opacities, log_scales = 1 / (1 + np.exp(-opacity)), scale
+            if notes is not None and is_share:
+                notes.append(
+                    "all opacities are between 0 and 1: they are read as logits, 0.5 to 0.73 opaque"
+                )
+            if notes is not None and is_length:
+                notes.append(
+                    "all scales are positive: they are read as logarithms, at least 1 unit wide"
+                )
+        if FILTER in (vertex.dtype.names or ()):
+            # Source: Yu et al., "Mip-Splatting: Alias-free 3D Gaussian Splatting", CVPR 2024.
+            width = column(path, vertex, FILTER, notes=notes)[:, None]
+            filtered = np.log(np.exp(2 * log_scales) + width * width) / 2
+            opacities = opacities * np.exp((log_scales - filtered).sum(axis=1))
+            log_scales = filtered
+            note(
+                path,
+                notes,
+                "the splats have the filter_3D of Mip-Splatting",
+                "it is applied to their scales and opacities",
+            )
+    return opacities, log_scales
+
+
+def _rest_properties(
+    path: Path, vertex: NDArray[np.void], notes: list[str] | None
+) -> tuple[str, ...]:
     """Names of the harmonics past the first; checks that they form a whole degree."""
     given = [name for name in vertex.dtype.names or () if name.startswith("f_rest_")]
     names = _rest_names(len(given))
+    if set(given) == set(names) and len(names) == 3 * DEGREE_4:
+        note(path, notes, "the spherical harmonics have degree 4", "only degrees 0 to 3 are read")
+        return tuple(name for k, name in enumerate(names) if k % DEGREE_4 < max(SH_DEGREES) - 1)
     if set(given) != set(names) or len(names) // 3 + 1 not in SH_DEGREES or len(names) % 3:
         raise BundleError(
             f"{path}: {len(given)} f_rest properties; allowed are f_rest_0 to f_rest_8, _23, _44 "
@@ -336,15 +457,15 @@ def _rest_properties(path: Path, vertex: NDArray[np.void]) -> tuple[str, ...]:
 
 
 def _spherical_harmonics(
-    path: Path, vertex: NDArray[np.void], rest: tuple[str, ...]
+    path: Path, vertex: NDArray[np.void], rest: tuple[str, ...], notes: list[str] | None
 ) -> NDArray[np.float32]:
     """Coefficients [N, K, 3]; the file stores those past the first channel by channel."""
     per_channel = len(rest) // 3
     sh = np.empty((len(vertex), 1 + per_channel, 3), dtype=np.float32)
-    sh[:, 0] = columns(path, vertex, DC, np.float32)
+    sh[:, 0] = columns(path, vertex, DC, np.float32, notes)
     for channel in range(3):
         names = rest[channel * per_channel : (channel + 1) * per_channel]
-        sh[:, 1:, channel] = columns(path, vertex, names, np.float32)
+        sh[:, 1:, channel] = columns(path, vertex, names, np.float32, notes)
     return sh
 
 
@@ -420,9 +541,11 @@ class PlayCanvasPly:
         header = head.split(b"end_header", 1)[0]
         return header.startswith((b"ply\n", b"ply\r\n")) and b" packed_position" in header
 
-    def read(self, path: Path, *, max_bytes: int | None = None) -> GaussianCloud:
+    def read(
+        self, path: Path, *, max_bytes: int | None = None, notes: list[str] | None = None
+    ) -> GaussianCloud:
         """The Gaussians of a file. Raises BundleError naming the file and the reason."""
-        elements = read_ply_elements(path)
+        elements = read_ply_elements(path, notes)
         vertex, chunks = self._checked(path, elements)
         sh = elements.get("sh")
         rest = 0 if sh is None else len(sh.dtype.names or ()) // 3
@@ -430,7 +553,8 @@ class PlayCanvasPly:
         chunk_of = np.arange(len(vertex)) // CHUNK_SIZE
 
         def between(low: tuple[str, ...], high: tuple[str, ...], fraction: Float) -> Float:
-            a, b = columns(path, chunks, low)[chunk_of], columns(path, chunks, high)[chunk_of]
+            a = columns(path, chunks, low, notes=notes)[chunk_of]
+            b = columns(path, chunks, high, notes=notes)[chunk_of]
             return a * (1 - fraction) + b * fraction
 
         rgba = _unpack_8888(vertex["packed_color"])
@@ -444,6 +568,7 @@ class PlayCanvasPly:
             log_scales=between(LOW_SCALE, HIGH_SCALE, _unpack_11_10_11(vertex["packed_scale"])),
             opacities=rgba[:, 3],
             sh=np.concatenate([first, _rest(path, sh, len(vertex))], axis=1),
+            notes=notes,
         )
 
     def write(self, cloud: GaussianCloud, path: Path, *, comment: str = "") -> None:

@@ -50,12 +50,16 @@ class SplatFormat(Protocol):
         Always false for formats without a signature.
         """
 
-    def read(self, path: Path, *, max_bytes: int | None = None) -> GaussianCloud:
+    def read(
+        self, path: Path, *, max_bytes: int | None = None, notes: list[str] | None = None
+    ) -> GaussianCloud:
         """The Gaussians of a file, in the file's own frame and units.
 
         Args:
             path: the file.
             max_bytes: memory limit, checked before anything is unpacked. None for no limit.
+            notes: receives a sentence for each kind of data that is left out or not used as it is,
+                see :func:`note`. None refuses such a file.
 
         Raises:
             BundleTooLargeError: the limit is exceeded.
@@ -69,6 +73,17 @@ class SplatFormat(Protocol):
             SceneError: for values the format cannot hold.
             OSError: the file cannot be written.
         """
+
+
+def note(path: Path, notes: list[str] | None, found: str, done: str) -> None:
+    """Add to ``notes`` what was found in the file and what was done about it.
+
+    Raises:
+        BundleError: there are no ``notes``; the message says what was found.
+    """
+    if notes is None:
+        raise BundleError(f"{path}: {found}")
+    notes.append(f"{found}: {done}")
 
 
 def check_memory(path: Path, count: int, harmonics: int, max_bytes: int | None) -> None:
@@ -104,13 +119,23 @@ def require_properties(
         )
 
 
-def column(path: Path, records: NDArray[np.void], name: str, *, infinite: bool = False) -> Float:
+def column(
+    path: Path,
+    records: NDArray[np.void],
+    name: str,
+    *,
+    infinite: bool = False,
+    notes: list[str] | None = None,
+) -> Float:
     """A property [N] of records as float64.
 
     Raises:
-        BundleError: for NaN and, unless ``infinite`` is allowed, for infinite values.
+        BundleError: without ``notes``, for NaN and, unless ``infinite`` is allowed, for infinite
+            values. With them, :func:`build_cloud` leaves such splats out.
     """
     values = np.asarray(records[name], dtype=np.float64)
+    if notes is not None:
+        return values
     bad = np.isnan(values) if infinite else ~np.isfinite(values)
     if bad.any():
         raise BundleError(
@@ -125,15 +150,16 @@ def columns(
     records: NDArray[np.void],
     names: tuple[str, ...],
     dtype: type[np.floating[Any]] = np.float64,
+    notes: list[str] | None = None,
 ) -> NDArray[Any]:
-    """Properties [N, len(names)] of records, finite; float64 unless ``dtype`` names another type.
+    """Properties [N, len(names)] of records; float64 unless ``dtype`` names another type.
 
     Raises like :func:`column`.
     """
     values = np.empty((len(records), len(names)), dtype=dtype)
     for index, name in enumerate(names):
         with np.errstate(over="ignore"):
-            values[:, index] = column(path, records, name)
+            values[:, index] = column(path, records, name, notes=notes)
     return values
 
 
@@ -150,35 +176,49 @@ def build_cloud(
     log_scales: NDArray[np.floating[Any]],
     opacities: NDArray[np.floating[Any]],
     sh: NDArray[np.floating[Any]],
+    notes: list[str] | None = None,
 ) -> GaussianCloud:
     """A cloud from parameters as stored in files: quats [N, 4] wxyz of any length, log scales.
 
-    Arrays of float32 are not copied, to save memory.
+    Arrays of float32 are not copied, to save memory. Splats with values that are not finite in
+    float32 are left out; rotations of length zero do not rotate. Both are in the ``notes``.
 
     Raises:
-        BundleError: quaternions of length zero, or values beyond the range of float32.
+        BundleError: no splat is left; without ``notes``, also for values that would be in them.
     """
-    norms = np.linalg.norm(quats, axis=1, keepdims=True)
-    zero = norms[:, 0] < 1e-12
-    if zero.any():
-        raise BundleError(
-            f"{path}: {int(zero.sum())} of {len(quats)} rotations have length zero, "
-            f"the first at {int(np.argmax(zero))}"
-        )
-    with np.errstate(over="ignore", under="ignore"):
+    count = len(means)
+    with np.errstate(over="ignore", under="ignore", invalid="ignore", divide="ignore"):
+        norms = np.linalg.norm(quats, axis=1, keepdims=True)
+        zero = norms[:, 0] < 1e-12
         scales = np.maximum(np.exp(log_scales), MIN_SCALE)
         parts = {
             "means": means,
-            "quats": quats / norms,
+            "quats": np.where(zero[:, None], np.array([1.0, 0.0, 0.0, 0.0]), quats / norms),
             "scales": scales,
             "opacities": opacities,
             "sh": sh,
         }
         arrays = {name: np.ascontiguousarray(v, dtype=np.float32) for name, v in parts.items()}
-    for name, array in arrays.items():
-        count = int((~np.isfinite(array)).sum())
-        if count:
-            raise BundleError(f"{path}: {count} values of {name} are beyond the range of float32")
+    if zero.any():
+        note(
+            path,
+            notes,
+            f"{int(zero.sum())} of {count} rotations have length zero, the first at "
+            f"{int(np.argmax(zero))}",
+            "these splats are not rotated",
+        )
+    bad = {k: ~np.isfinite(v.reshape(count, -1)).all(axis=1) for k, v in arrays.items() if count}
+    unusable = np.any(list(bad.values()), axis=0) if count else np.zeros(0, bool)
+    if unusable.any():
+        where = ", ".join(f"{int(rows.sum())} {k}" for k, rows in bad.items() if rows.any())
+        sentence = (
+            f"{int(unusable.sum())} of {count} splats have values that are NaN, infinite or beyond "
+            f"the range of float32 ({where})"
+        )
+        if unusable.all():
+            raise BundleError(f"{path}: {sentence}; no splat is left")
+        note(path, notes, sentence, "they are left out")
+        arrays = {name: array[~unusable] for name, array in arrays.items()}
     return GaussianCloud(**{name: torch.from_numpy(array) for name, array in arrays.items()})
 
 
@@ -209,7 +249,9 @@ class AntimatterSplat:
         """Always false: there is no header."""
         return False
 
-    def read(self, path: Path, *, max_bytes: int | None = None) -> GaussianCloud:
+    def read(
+        self, path: Path, *, max_bytes: int | None = None, notes: list[str] | None = None
+    ) -> GaussianCloud:
         """The Gaussians of a file. Raises BundleError naming the file and the reason."""
         nbytes = path.stat().st_size
         if nbytes % SPLAT_RECORD.itemsize:
@@ -224,12 +266,12 @@ class AntimatterSplat:
             "scale": ~(np.isfinite(records["scale"]) & (records["scale"] >= 0)),
         }.items():
             count = int(bad.any(axis=1).sum())
-            if count:
+            if count and notes is None:
                 raise BundleError(
                     f"{path}: {name} is NaN, infinite or negative in {count} of {len(records)} "
                     f"splats, the first at {int(np.argmax(bad.any(axis=1)))}"
                 )
-        with np.errstate(divide="ignore"):
+        with np.errstate(divide="ignore", invalid="ignore"):
             log_scales = np.log(records["scale"].astype(np.float64))
         rgba = records["rgba"] / 255.0
         return build_cloud(
@@ -239,6 +281,7 @@ class AntimatterSplat:
             log_scales=log_scales,
             opacities=rgba[:, 3],
             sh=((rgba[:, :3] - 0.5) / SH_C0).astype(np.float32)[:, None, :],
+            notes=notes,
         )
 
     def write(self, cloud: GaussianCloud, path: Path) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal, cast, overload
 
 import numpy as np
+import torch
 
 from ...geometry import Float, quaternion_to_matrix, yaw_quaternion
 from ..asset import Asset
@@ -35,6 +36,9 @@ _ROTATIONS: dict[str, list[list[float]]] = {
 OpenCV and COLMAP (z forward, x right).
 """
 
+MAX_REACH = 1e6
+"""Maximum coordinate and scale of imported splats [m]; float32 has steps of 6 cm there."""
+
 VIEW_DURATION_US = 10_000_000
 """Duration of the stationary ego in an imported scene, enough for a drive through it."""
 
@@ -56,12 +60,16 @@ def suffixes() -> tuple[str, ...]:
     return tuple(splat_format.suffix for splat_format in FORMATS)
 
 
-def read_splats(path: str | PathLike[str], *, max_bytes: int | None = None) -> GaussianCloud:
+def read_splats(
+    path: str | PathLike[str], *, max_bytes: int | None = None, notes: list[str] | None = None
+) -> GaussianCloud:
     """Read a splat file of any known format, in its own frame and units.
 
     Args:
         path: the file.
         max_bytes: memory limit of its Gaussians; None for no limit.
+        notes: receives a sentence for each kind of data that is left out or not used as it is.
+            None refuses such a file.
 
     Raises:
         BundleTooLargeError: the limit is exceeded.
@@ -72,10 +80,10 @@ def read_splats(path: str | PathLike[str], *, max_bytes: int | None = None) -> G
     head = _head(file)
     for splat_format in FORMATS:
         if splat_format.recognises(head):
-            return splat_format.read(file, max_bytes=max_bytes)
+            return splat_format.read(file, max_bytes=max_bytes, notes=notes)
     for splat_format in FORMATS:
         if not splat_format.has_signature and file.name.lower().endswith(splat_format.suffix):
-            return splat_format.read(file, max_bytes=max_bytes)
+            return splat_format.read(file, max_bytes=max_bytes, notes=notes)
     known = ", ".join(f.name for f in FORMATS)
     raise BundleError(f"{file}: not a ply nor any other known splat format; known are: {known}")
 
@@ -180,7 +188,8 @@ def import_splats(
         as_asset: make an asset instead of a scene.
         category: class of the asset.
         up_axis: axis of the file that points up; trained splats mostly have ``-y``. None: from its
-            format or header (:func:`up_axis_of`), else ``z``.
+            format or header (:func:`up_axis_of`), else ``z``. The provenance has the axis, and in
+            ``notes`` what was left out or not used as it is.
         yaw: rotation about z after that [rad], to align the front of an object with x.
         scale: metres per unit of the file.
         max_bytes: memory limit of its Gaussians; None for no limit.
@@ -191,11 +200,18 @@ def import_splats(
         SceneError: an unknown ``up_axis`` or a scale that is not positive.
     """
     file = Path(path)
-    cloud = read_splats(file, max_bytes=max_bytes)
-    up_axis = up_axis or up_axis_of(file) or "z"
+    notes: list[str] = []
+    cloud = read_splats(file, max_bytes=max_bytes, notes=notes)
+    stated = up_axis_of(file)
+    if up_axis is None and stated is None:
+        notes.append(
+            "the file does not say which axis points up: z is used; for most trained splats, set "
+            "up_axis to -y"
+        )
+    up_axis = up_axis or stated or "z"
     if not len(cloud):
         raise BundleError(f"{file}: holds no splats; nothing to import")
-    placed = cloud.moved(upright(up_axis, yaw), scale=scale)
+    placed = within_reach(cloud.moved(upright(up_axis, yaw), scale=scale), file, notes)
     provenance = {
         "source": "splat file",
         "file": file.name,
@@ -203,10 +219,31 @@ def import_splats(
         "up_axis": up_axis,
         "yaw": yaw,
         "scale": scale,
+        "notes": notes,
     }
     if as_asset:
         return asset_from_cloud(placed, name=name, category=category, provenance=provenance)
     return scene_from_cloud(placed, name=name, provenance=provenance)
+
+
+def within_reach(cloud: GaussianCloud, file: Path, notes: list[str]) -> GaussianCloud:
+    """``cloud`` [m] without splats that are too far away or too wide for float32."""
+    far = (cloud.means.abs() > MAX_REACH).any(dim=1)
+    wide = (cloud.scales > MAX_REACH).any(dim=1)
+    bad = far | wide
+    if not bad.any():
+        return cloud
+    sentence = (
+        f"{int(bad.sum())} of {len(cloud)} splats are more than {MAX_REACH / 1000:g} km from the "
+        f"origin ({int(far.sum())}) or as wide ({int(wide.sum())})"
+    )
+    if bad.all():
+        raise BundleError(
+            f"{file}: {sentence}; no splat is left. Check the unit, and subtract an offset from "
+            "geographic coordinates"
+        )
+    notes.append(f"{sentence}: they are left out")
+    return cloud.select(torch.nonzero(~bad)[:, 0])
 
 
 def asset_from_cloud(
@@ -220,11 +257,17 @@ def asset_from_cloud(
     return Asset(name, category, (length, width, height), cloud.moved(to_centre), provenance)
 
 
-def scene_from_cloud(cloud: GaussianCloud, *, name: str, provenance: dict[str, Any]) -> Scene:
+def scene_from_cloud(
+    cloud: GaussianCloud,
+    *,
+    name: str,
+    provenance: dict[str, Any],
+    times_us: tuple[int, int] = (0, VIEW_DURATION_US),
+) -> Scene:
     """A scene with ``cloud`` as background, seen along x by one camera that covers its robust box.
 
-    The ego is stationary behind the box for ten seconds. Its camera ``front`` looks at the box's
-    centre.
+    The ego is stationary behind the box during ``times_us``. Its camera ``front`` looks at the
+    centre of the box.
     """
     low, high = robust_bounds(cloud)
     centre, extent = (low + high) / 2, np.maximum(high - low, 1e-3)
@@ -241,7 +284,7 @@ def scene_from_cloud(cloud: GaussianCloud, *, name: str, provenance: dict[str, A
         np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]),
         pose,
     )
-    times = np.array([0, VIEW_DURATION_US], dtype=np.int64)
+    times = np.array(times_us, dtype=np.int64)
     ego = Trajectory(times, np.array([position] * 2), np.array([[1.0, 0, 0, 0]] * 2))
     return Scene(name, cloud, {}, None, CameraRig((camera,)), ego, times, provenance=provenance)
 

@@ -305,16 +305,19 @@ class Spz:
         """Whether ``head`` belongs to a plain or gzipped spz file."""
         return is_spz(head)
 
-    def read(self, path: Path, *, max_bytes: int | None = None) -> GaussianCloud:
+    def read(
+        self, path: Path, *, max_bytes: int | None = None, notes: list[str] | None = None
+    ) -> GaussianCloud:
         """The Gaussians of a file. Raises BundleError naming the file and the reason."""
         header, streams = read_streams(path, max_bytes=max_bytes)
         return build_cloud(
             path,
-            means=_positions(path, header, streams),
+            means=_positions(path, header, streams, notes),
             quats=_rotations(header, streams),
             log_scales=streams.scales.reshape(-1, 3) / 16.0 - 10,
             opacities=streams.alphas / 255.0,
             sh=_spherical_harmonics(header, streams),
+            notes=notes,
         )
 
     def write(self, cloud: GaussianCloud, path: Path) -> None:
@@ -344,11 +347,13 @@ class Spz:
         return write_streams(header, streams, gzip_level=self.gzip_level)
 
 
-def _positions(path: Path, header: Header, streams: Streams) -> NDArray[np.float32]:
+def _positions(
+    path: Path, header: Header, streams: Streams, notes: list[str] | None
+) -> NDArray[np.float32]:
     if header.version == 1:
         means = streams.positions.view("<f2").astype(np.float32).reshape(-1, 3)
         bad = int((~np.isfinite(means)).any(axis=1).sum())
-        if bad:
+        if bad and notes is None:
             raise BundleError(
                 f"{path}: position is NaN or infinite in {bad} of {len(means)} splats"
             )

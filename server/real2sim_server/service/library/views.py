@@ -14,8 +14,11 @@ from real2sim_proto.scenes import CameraInfo, ObjectInfo, SceneInfo, SceneState
 from real2sim_proto.sensors import OpticsSpec
 
 from ...edit import ObjectState
+from ...geometry import invert_transform
 from ...scene import Camera, GaussianCloud, Trajectory
 from ...scene.io import SceneSummary
+from ...scene.io.splat_format import UpAxis
+from ...scene.io.splats import upright
 from ...scene.io.spz import Spz
 from ...scene.lens import lens_values
 from .scenes import Listing
@@ -145,6 +148,13 @@ MAX_BYTES = 64 << 20
 Kept = TypeVar("Kept", bytes, Tensor)
 
 
+def spz_of(cloud: GaussianCloud, up_axis: UpAxis) -> bytes:
+    """An spz file of ``cloud`` (z up), with ``up_axis`` up."""
+    if up_axis != "z":
+        cloud = cloud.moved(invert_transform(upright(up_axis, 0.0)))
+    return Spz(gzip_level=GZIP_LEVEL).encode(cloud)
+
+
 class SplatFiles:
     """Parts of clouds as spz files, sorted by decreasing coverage, with a least-recently-used
     cache.
@@ -166,7 +176,15 @@ class SplatFiles:
         """Size of the cache [bytes]."""
         return self._bytes
 
-    def part(self, cloud: GaussianCloud, known: tuple[str, ...], first: int, count: int) -> bytes:
+    def part(
+        self,
+        cloud: GaussianCloud,
+        known: tuple[str, ...],
+        first: int,
+        count: int,
+        *,
+        up_axis: UpAxis = "y",
+    ) -> bytes:
         """An spz file of at most ``count`` Gaussians after the ``first`` ones.
 
         Args:
@@ -174,12 +192,13 @@ class SplatFiles:
             known: cache key of the content of ``cloud``.
             first: number of Gaussians to skip.
             count: maximum number.
+            up_axis: axis that points up in the file.
         """
         with self._turn:
             return self._remembered(
-                (*known, first, count),
-                lambda: Spz(gzip_level=GZIP_LEVEL).encode(
-                    cloud.select(self._order(cloud, known)[first : first + count].long())
+                (*known, first, count, up_axis),
+                lambda: spz_of(
+                    cloud.select(self._order(cloud, known)[first : first + count].long()), up_axis
                 ),
             )
 

@@ -21,7 +21,7 @@ from real2sim_proto import ErrorCode
 from real2sim_proto.base import Identifier, Microseconds
 from real2sim_proto.jobs import JobInfo
 from real2sim_proto.lanes import SceneLanes
-from real2sim_proto.scenes import SceneImport, SceneInfo, SceneList, SceneState
+from real2sim_proto.scenes import SceneImport, SceneInfo, SceneList, SceneState, UpAxis
 from real2sim_proto.sessions import SceneView
 
 from ...edit import ScenarioState, cloud_of, figure_of
@@ -30,7 +30,6 @@ from ...scene import Scene
 from ...scene.io import DEMO_SCENE, SHIPPED_STREET
 from ...scene.io.document import lane_document
 from ...scene.io.splats import suffixes
-from ...scene.io.spz import Spz
 from ..http.auth import TokenRoute
 from ..http.requests import ClientName, IdempotencyKey, form_digest
 from ..http.responses import ServiceError, cancel_on_disconnect, etag, info_response, large_response
@@ -44,7 +43,7 @@ from ..library.imports import (
     staging_folder,
 )
 from ..library.scenes import bundle_folder
-from ..library.views import GZIP_LEVEL, scene_info
+from ..library.views import scene_info, spz_of
 from ..renderer import FRAME_RESPONSES, choose_frames_type, frame_response, frames_response
 from ..worker import Worker, WorkerOf
 from .queries import FrameQueryOf, free_view_request
@@ -360,6 +359,7 @@ KnownHash = Annotated[
         ),
     ),
 ]
+SpzUpAxis = Annotated[UpAxis, Query(description="axis that points up in the file")]
 IfNoneMatch = Annotated[str | None, Header(description="answer 304 if the ETag is unchanged")]
 
 
@@ -397,13 +397,15 @@ async def splats(
     count: Annotated[
         int, Query(ge=1, le=MAX_COUNT, description="largest number of Gaussians")
     ] = DEFAULT_COUNT,
+    up_axis: SpzUpAxis = "y",
     content_hash: KnownHash = None,
     if_none_match: IfNoneMatch = None,
 ) -> Response:
     """Gaussians of the background (world frame) or of one object (its box's frame) as an spz file,
-    sorted by decreasing coverage; z is up."""
+    sorted by decreasing coverage. Spz files are y up (z forward); with `up_axis=z` the file has the
+    axes of the scene."""
     resident = await worker.scene_cache.get(scene)
-    headers = _caching(resident, content_hash, f"splats {object_id} {first} {count}")
+    headers = _caching(resident, content_hash, f"splats {object_id} {first} {count} {up_axis}")
     subject = None if object_id is None else resident.object(object_id)
     cloud = resident.background if subject is None else subject.cloud
     if subject is not None and subject.figure is not None:
@@ -413,7 +415,9 @@ async def splats(
         return Response(status_code=304, headers=headers)
 
     known = (resident.content_hash, object_id or "")
-    file = await asyncio.to_thread(worker.splat_files.part, cloud, known, first, count)
+    file = await asyncio.to_thread(
+        worker.splat_files.part, cloud, known, first, count, up_axis=up_axis
+    )
     return Response(file, media_type=SPZ, headers=headers)
 
 
@@ -496,10 +500,11 @@ async def object_splats(
     t_us: Annotated[
         Microseconds | None, Query(description="default: start of the scenario")
     ] = None,
+    up_axis: SpzUpAxis = "y",
 ) -> Response:
     """The current Gaussians of one object of a scenario, sorted by decreasing coverage: of an
     asset, or of a person in the pose at ``t_us``, at its edited size. An spz file in the frame of
-    its box; z is up."""
+    its box, y up (z forward); with `up_axis=z` it has the axes of the box."""
     view = await worker.scenarios.view(scenario_id)
     scene = await worker.scene_cache.get(view.row.scene)
     subject = next((o for o in view.state.visible if o.object_id == object_id), None)
@@ -518,6 +523,6 @@ async def object_splats(
         cloud = cloud_of(scene, subject, instant)
         if subject.scale != (1.0, 1.0, 1.0):
             cloud = cloud.stretched(subject.scale)
-        return Spz(gzip_level=GZIP_LEVEL).encode(cloud.select(cloud.by_importance()))
+        return spz_of(cloud.select(cloud.by_importance()), up_axis)
 
     return Response(await asyncio.to_thread(made), media_type=SPZ, headers=headers)

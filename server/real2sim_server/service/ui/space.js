@@ -128,11 +128,11 @@ function lookOf(subject) {
   const scale = scaleOf(subject);
   const fleeting = world.walking.has(who);
   if (scale && !fleeting) {
-    const path = world.url("splats", { object_id: source, count: MOST });
+    const path = world.url("splats", { object_id: source, count: MOST, up_axis: "z" });
     return { scale, look: { key: who, who, path } };
   }
   const { scenario_id: scenario, revision } = model.scenario;
-  const query = new URLSearchParams({ object_id: id, t_us: model.t });
+  const query = new URLSearchParams({ object_id: id, t_us: model.t, up_axis: "z" });
   const path = `/v1/scenarios/${encodeURIComponent(scenario)}/splats?${query}`;
   const key = fleeting ? `${scenario} ${revision} ${id} ${model.t}` : `${who} ${size}`;
   return { scale: 1, look: { key, who, path, fleeting } };

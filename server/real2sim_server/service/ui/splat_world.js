@@ -55,7 +55,7 @@ export class SplatWorld {
     return { total, figure, fileBytes: new Uint8Array(await answer.arrayBuffer()) };
   }
   part(query) {
-    return this.file(this.url("splats", query));
+    return this.file(this.url("splats", { ...query, up_axis: "z" }));
   }
   async mesh(options) {
     const mesh = new SplatMesh({ fileType: SplatFileType.SPZ, extSplats: true, ...options });

@@ -7,9 +7,16 @@ from typer.testing import CliRunner
 
 from real2sim.cli import build_app
 from real2sim_server.geometry import apply_transform
-from real2sim_server.scene import GaussianCloud, SceneError, Trajectory, UnknownObjectError
+from real2sim_server.scene import (
+    BundleError,
+    GaussianCloud,
+    SceneError,
+    Trajectory,
+    UnknownObjectError,
+)
 from real2sim_server.scene.io import (
     export_scene,
+    import_exported,
     import_splats,
     load_scene,
     read_splats,
@@ -49,7 +56,7 @@ def test_a_baked_scene_holds_all_gaussians_at_their_poses(scene, t_us, tmp_path,
 
 @pytest.mark.parametrize(
     ("name", "axis", "within"),
-    [("spz", "y", 1e-3), ("ply", "z", 1e-6), ("compressed.ply", "z", 0.06), ("splat", "z", 1e-6)],
+    [("spz", "y", 1e-3), ("ply", "z", 1e-6), ("compressed.ply", "z", 1e-3), ("splat", "z", 1e-6)],
 )
 def test_exported_files_import_with_the_same_extent(scene, t_us, tmp_path, name, axis, within):
     save_scene(scene, tmp_path / "a.r2s")
@@ -181,3 +188,47 @@ def test_a_suffix_of_another_format_is_refused(scene, tmp_path):
 def test_a_scene_without_objects_bakes_to_its_background(scene, tmp_path):
     assert len(bake(scene, scene.start_us, objects={})) == len(scene.background)
     assert isinstance(bake(scene, scene.start_us), GaussianCloud)
+
+
+@pytest.mark.parametrize("name", SPLATS)
+def test_an_exported_folder_is_imported_with_its_objects(scene, tmp_path, name):
+    save_scene(scene, tmp_path / "a.r2s")
+    for words in (
+        ["export", tmp_path / "a.r2s", "--out", tmp_path / "out", "--format", name],
+        ["import", tmp_path / "out", "--out", tmp_path / "b.r2s"],
+    ):
+        done = CliRunner().invoke(build_app(), [*map(str, words)])
+        assert done.exit_code == 0, done.output
+    back = load_scene(tmp_path / "b.r2s")
+    assert back.provenance["up_axis"] == ("y" if name == "spz" else "z")
+    assert extent(back.background) == pytest.approx(extent(scene.background), abs=1e-3)
+    assert list(back.objects) == list(scene.objects)
+    for object_id, expected in scene.objects.items():
+        subject = back.objects[object_id]
+        assert extent(subject.cloud) == pytest.approx(extent(expected.cloud), abs=1e-3)
+        assert (subject.category, subject.size) == (expected.category, expected.size)
+        assert (subject.trajectory.positions == expected.trajectory.positions).all()
+        assert back.start_us <= subject.trajectory.start_us <= subject.trajectory.end_us
+        assert subject.trajectory.end_us <= back.end_us
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "reason"),
+    [
+        ("background", "../out/background.ply", "not the name of a file beside it"),
+        ("T_file_scene", [[0.0] * 4] * 4, "T_file_scene"),
+        ("objects", 3, "objects"),
+        ("format", "other", "format"),
+    ],
+)
+def test_a_damaged_index_is_refused(scene, tmp_path, key, value, reason):
+    export_scene(scene, tmp_path / "out", format="ply")
+    file = tmp_path / "out" / "objects.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | {key: value}))
+    with pytest.raises(BundleError, match=reason):
+        import_exported(tmp_path / "out", name="a")
+
+
+def test_a_folder_without_index_is_refused(tmp_path):
+    with pytest.raises(BundleError, match=r"a folder without objects\.json"):
+        import_exported(tmp_path, name="a")

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from real2sim_server.scene import BundleError, GaussianCloud, SceneError
-from real2sim_server.scene.io import read_splats, write_splats
+from real2sim_server.scene.io import import_splats, read_splats, write_splats
 
 BASE = (
     *("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
@@ -113,6 +113,95 @@ def test_infinity_is_refused(columns, tmp_path, name):
         read_splats(write_columns(tmp_path / "a.ply", columns))
 
 
+def test_damaged_splats_are_left_out_and_counted(columns, tmp_path):
+    columns["x"][1] = np.nan
+    columns["f_dc_2"][[1, 3]] = np.inf
+    columns["scale_0"][4] = 200
+    file = write_columns(tmp_path / "a.ply", columns)
+    notes: list[str] = []
+    cloud = read_splats(file, notes=notes)
+    assert cloud.means[:, 1].tolist() == columns["y"][[0, 2, 5]].tolist()
+    (sentence,) = notes
+    assert sentence.startswith("3 of 6 splats")
+    assert "(1 means, 1 scales, 2 sh): they are left out" in sentence
+    assert import_splats(file, name="a").provenance["notes"][0] == sentence
+
+
+def test_a_file_without_usable_splats_is_refused(columns, tmp_path):
+    columns["y"][:] = np.nan
+    with pytest.raises(BundleError, match=r"6 of 6 splats .* no splat is left"):
+        read_splats(write_columns(tmp_path / "a.ply", columns), notes=[])
+
+
+def test_rotations_of_length_zero_do_not_rotate(columns, tmp_path):
+    for k in range(4):
+        columns[f"rot_{k}"][2] = 0
+    notes: list[str] = []
+    cloud = read_splats(write_columns(tmp_path / "a.ply", columns), notes=notes)
+    assert cloud.quats[2].tolist() == [1, 0, 0, 0]
+    assert notes == [
+        "1 of 6 rotations have length zero, the first at 2: these splats are not rotated"
+    ]
+
+
+def test_activated_parameters_are_recognised(columns, tmp_path):
+    plain = read_splats(write_columns(tmp_path / "a.ply", columns))
+    columns["opacity"] = plain.opacities.numpy()
+    for k in range(3):
+        columns[f"scale_{k}"] = plain.scales[:, k].numpy()
+    notes: list[str] = []
+    cloud = read_splats(write_columns(tmp_path / "b.ply", columns), notes=notes)
+    torch.testing.assert_close(cloud.opacities, plain.opacities)
+    torch.testing.assert_close(cloud.scales, plain.scales)
+    assert ["read as they are" in sentence for sentence in notes] == [True]
+
+
+@pytest.mark.parametrize("part", ["opacity", "scale"])
+def test_doubtful_parameters_are_told(columns, tmp_path, part):
+    for name in columns:
+        if name.startswith(part):
+            columns[name] = np.abs(columns[name]) % 1
+    notes: list[str] = []
+    cloud = read_splats(write_columns(tmp_path / "a.ply", columns), notes=notes)
+    torch.testing.assert_close(cloud.scales[:, 0], torch.from_numpy(columns["scale_0"]).exp())
+    torch.testing.assert_close(cloud.opacities, torch.from_numpy(columns["opacity"]).sigmoid())
+    assert len(notes) == 1
+
+
+def test_own_files_are_never_mistaken_for_activated_ones(make_cloud, tmp_path):
+    cloud = make_cloud(3)
+    cloud.opacities[:], cloud.scales[:] = 0.6, 3.0
+    write_splats(cloud, tmp_path / "a.ply")
+    notes: list[str] = []
+    back = read_splats(tmp_path / "a.ply", notes=notes)
+    torch.testing.assert_close(back.scales, cloud.scales)
+    torch.testing.assert_close(back.opacities, cloud.opacities)
+    assert notes == []
+
+
+def test_the_3d_filter_of_mip_splatting_is_applied(columns, tmp_path):
+    plain = read_splats(write_columns(tmp_path / "a.ply", columns))
+    width = np.linspace(0, 0.5, 6, dtype=np.float32)
+    notes: list[str] = []
+    file = write_columns(tmp_path / "b.ply", columns | {"filter_3D": width})
+    cloud = read_splats(file, notes=notes)
+    squares = plain.scales.square()
+    wider = squares + torch.from_numpy(width)[:, None] ** 2
+    factor = (squares.prod(dim=1) / wider.prod(dim=1)).sqrt()
+    torch.testing.assert_close(cloud.scales, wider.sqrt())
+    torch.testing.assert_close(cloud.opacities, plain.opacities * factor)
+    assert ["filter_3D" in sentence for sentence in notes] == [True]
+
+
+def test_harmonics_of_degree_four_are_cut(columns, tmp_path):
+    rest = {f"f_rest_{i}": np.full(6, i, np.float32) for i in range(72)}
+    notes: list[str] = []
+    cloud = read_splats(write_columns(tmp_path / "a.ply", columns | rest), notes=notes)
+    assert cloud.sh_degree == 3
+    assert cloud.sh[0, 1:, 1].tolist() == [24 + k for k in range(15)]
+    assert len(notes) == 1
+
+
 def test_infinite_logits_become_opacities_of_zero_and_one(columns, tmp_path):
     columns["opacity"][:2] = [-np.inf, np.inf]
     cloud = read_splats(write_columns(tmp_path / "a.ply", columns))
@@ -128,7 +217,9 @@ def test_zero_length_rotations_are_refused(columns, tmp_path):
 
 def test_scales_beyond_float32_are_refused(columns, tmp_path):
     columns["scale_0"][1] = 200
-    with pytest.raises(BundleError, match="1 values of scales are beyond"):
+    with pytest.raises(
+        BundleError, match=r"1 of 6 splats .* beyond the range of float32 \(1 scales\)"
+    ):
         read_splats(write_columns(tmp_path / "a.ply", columns))
 
 

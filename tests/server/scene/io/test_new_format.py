@@ -34,7 +34,9 @@ class SplatCsv:
     def recognises(self, head: bytes) -> bool:
         return head.startswith(",".join(COLUMNS).encode())
 
-    def read(self, path: Path, *, max_bytes: int | None = None) -> GaussianCloud:
+    def read(
+        self, path: Path, *, max_bytes: int | None = None, notes: list[str] | None = None
+    ) -> GaussianCloud:
         lines = path.read_text(encoding="ascii").split("\n")
         if lines[-1]:
             raise BundleError(f"{path}: its last line is cut off")
@@ -48,6 +50,7 @@ class SplatCsv:
             log_scales=scales,
             opacities=1 / (1 + np.exp(-logits[:, 0])),
             sh=colours[:, None, :],
+            notes=notes,
         )
 
     def write(self, cloud: GaussianCloud, path: Path) -> None:

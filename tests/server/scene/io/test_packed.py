@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial import cKDTree
+from typer.testing import CliRunner
 
+from real2sim.cli import build_app
 from real2sim_server.scene import BundleError, TimeColour
-from real2sim_server.scene.io import read_packed, write_packed
+from real2sim_server.scene.io import open_scene, read_packed, save_scene, write_packed
 
 
 @pytest.fixture
@@ -151,3 +153,28 @@ def test_packing_saves_60_percent(make_cloud, scene, tmp_path):
     write_packed(big, tmp_path / "big.r2s.zip")
     raw = sum(np.prod(t.shape) * 4 for t in big.background.tensors().values())
     assert (tmp_path / "big.r2s.zip").stat().st_size < raw / 2.5
+
+
+def test_scenes_are_opened_by_path_and_name(scene, tmp_path):
+    saved = save_scene(scene, tmp_path / "a.r2s")
+    assert open_scene(tmp_path / "a.r2s").content_hash == saved.content_hash
+    assert open_scene("a.r2s", tmp_path).content_hash == saved.content_hash
+    write_packed(scene, tmp_path / "a.r2s.zip")
+    packed = save_scene(read_packed(tmp_path / "a.r2s.zip"), tmp_path / "b.r2s")
+    assert open_scene(tmp_path / "a.r2s.zip").content_hash == packed.content_hash
+    with pytest.raises(BundleError, match=r"no scene 'nowhere'; .* demo_street"):
+        open_scene("nowhere", tmp_path)
+
+
+def test_commands_take_the_shipped_scene_by_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+    def run(*words):
+        return CliRunner().invoke(build_app(), [*words, "--json", "figures.json"])
+
+    assert "demo_street: has no lanes" in " ".join(run("map", "demo_street").output.split())
+    log = tmp_path / "log"
+    log.mkdir()
+    refused = run("fit-lidar", "demo_street", str(log))
+    assert "demo_street is not a bundle that can be changed" in " ".join(refused.output.split())
+    assert not (tmp_path / "demo_street").exists()

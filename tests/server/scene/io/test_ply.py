@@ -80,7 +80,7 @@ def test_an_element_without_records_is_empty(ply):
         ("ply\n", "no end_header"),
         ("ply\nend_header\n", "no format line"),
         (HEADER[:60], "no end_header"),
-        (HEADER.replace("binary_little_endian", "ascii"), "ascii ply is not supported"),
+        (HEADER.replace("binary_little_endian", "ascii"), "could not convert"),
         (HEADER.replace("little_endian 1.0", "little_endian 2.0"), "format"),
         (HEADER.replace("format", "fromat"), "fromat"),
         (HEADER.replace("vertex 3", "vertex -3"), "count '-3'"),
@@ -98,6 +98,30 @@ def test_an_element_without_records_is_empty(ply):
 def test_bad_headers_are_refused_with_file_and_reason(ply, header, reason):
     with pytest.raises(BundleError, match=rf"file\.ply: .*{reason}"):
         read_ply_elements(ply(header))
+
+
+def test_text_is_read(ply):
+    header = HEADER.replace("binary_little_endian", "ascii")
+    rows = [" ".join(repr(value) for value in row) for row in RECORDS.tolist()]
+    text = "\n".join(rows).encode()
+    for data in (text, text + b"\n", text.replace(b"\n", b" \r\n\r\n")):
+        np.testing.assert_array_equal(read_ply_elements(ply(header, data))["vertex"], RECORDS)
+    short = "\n".join(rows[:2]).encode()
+    for data in (short, short + b" " * 100, text + b"\n1 2 3", text.replace(b" ", b"  9 ", 1)):
+        with pytest.raises(BundleError, match=r"file\.ply"):
+            read_ply_elements(ply(header, data))
+
+
+def test_elements_with_lists_after_the_vertices_are_left_out(ply):
+    header = HEADER.replace(
+        "end_header", "element face 1\nproperty list uchar int vertex_indices\nend_header"
+    )
+    file = ply(header, RECORDS.tobytes() + bytes([3, *[0] * 12]))
+    notes: list[str] = []
+    np.testing.assert_array_equal(read_ply_elements(file, notes)["vertex"], RECORDS)
+    assert ["'face' has list properties" in sentence for sentence in notes] == [True]
+    with pytest.raises(BundleError, match="'face' has list properties"):
+        read_ply_elements(file)
 
 
 def test_an_endless_header_is_refused(ply):

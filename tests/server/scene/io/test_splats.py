@@ -15,6 +15,7 @@ from real2sim_server.scene.io import (
     save_scene,
     write_splats,
 )
+from real2sim_server.scene.io.splats import suffixes
 
 
 @pytest.fixture
@@ -175,3 +176,39 @@ def test_a_real_torus_has_a_hole(test_data):
 def test_a_plain_point_cloud_is_refused_with_missing_properties(test_data):
     with pytest.raises(BundleError, match=r"lacks the properties \['f_dc_0'.*point cloud"):
         read_splats(real(test_data, "car_benz_points.ply"))
+
+
+def test_splats_out_of_reach_are_left_out(make_cloud, tmp_path):
+    cloud = make_cloud(5)
+    cloud.means[1, 0], cloud.scales[3] = -3e6, 2e6
+    write_splats(cloud, tmp_path / "a.ply")
+    scene = import_splats(tmp_path / "a.ply", name="a")
+    assert torch.equal(scene.background.means, cloud.means[[0, 2, 4]])
+    assert scene.provenance["notes"][-1] == (
+        "2 of 5 splats are more than 1000 km from the origin (1) or as wide (1): they are left out"
+    )
+    assert len(import_splats(tmp_path / "a.ply", name="a", scale=0.1).background) == 5
+
+
+def test_geographic_coordinates_are_refused(make_cloud, tmp_path):
+    cloud = make_cloud(5)
+    cloud.means[:, 1] += 5.3e6
+    write_splats(cloud, tmp_path / "a.ply")
+    with pytest.raises(BundleError, match=r"no splat is left.* subtract an offset"):
+        import_splats(tmp_path / "a.ply", name="a")
+
+
+def test_the_suffix_may_be_in_capitals(make_cloud, tmp_path):
+    for suffix in suffixes():
+        write_splats(make_cloud(5), tmp_path / f"a{suffix}")
+        (tmp_path / f"a{suffix}").rename(tmp_path / f"A{suffix.upper()}")
+        assert len(read_splats(tmp_path / f"A{suffix.upper()}")) == 5
+
+
+def test_an_unstated_up_axis_is_told(make_cloud, tmp_path):
+    write_splats(make_cloud(5), tmp_path / "a.ply")
+    write_splats(make_cloud(5), tmp_path / "b.ply", up_axis="-y")
+    one, other = (import_splats(tmp_path / f"{n}.ply", name="a").provenance for n in "ab")
+    assert (one["up_axis"], other["up_axis"]) == ("z", "-y")
+    assert "does not say which axis points up: z is used" in one["notes"][-1]
+    assert other["notes"] == []

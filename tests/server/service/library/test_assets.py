@@ -87,12 +87,15 @@ def test_every_splat_format_can_be_uploaded_with_a_metric_length(client, splat_f
     assert info.size[1] / info.size[0] == pytest.approx(1.8 / 4.0, rel=0.1)
 
 
-@pytest.mark.parametrize(("name", "axis"), [("spz", "y"), ("ply", "z"), ("compressed.ply", "z")])
+@pytest.mark.parametrize(
+    ("name", "axis"), [("spz", "y"), ("ply", "z"), ("compressed.ply", "z"), ("splat", "z")]
+)
 def test_an_exported_object_is_uploaded_upright(client, tiny_scene, tmp_path, name, axis):
     export_scene(tiny_scene, tmp_path / "out", format=name, objects=["car_red"])
     answer = upload(client, tmp_path / "out" / f"001_car_red.{name}", length="4")
     info = AssetInfo.model_validate(answer.json())
     assert info.provenance["up_axis"] == axis
+    assert bool(info.provenance["notes"]) == (name == "splat")
     # The size of the car.
     assert info.size == pytest.approx((4.0, 1.8, 1.5), rel=0.1)
 

@@ -16,7 +16,7 @@ from real2sim_server.service.library.views import SplatFiles
 
 
 def received(client, tmp_path, **query):
-    answer = client.get("/v1/scenes/tiny/splats", params=query)
+    answer = client.get("/v1/scenes/tiny/splats", params={"up_axis": "z", **query})
     assert answer.status_code == 200, answer.text
     path = tmp_path / "part.spz"
     path.write_bytes(answer.content)
@@ -151,7 +151,9 @@ def test_an_object_of_a_scenario_is_sent_as_edited(client, tiny_scene, tmp_path)
 
     def splats(object_id, **query):
         path = tmp_path / "one.spz"
-        sent = client.get(f"/v1/scenarios/{made}/splats", params={"object_id": object_id, **query})
+        sent = client.get(
+            f"/v1/scenarios/{made}/splats", params={"object_id": object_id, "up_axis": "z", **query}
+        )
         assert sent.status_code == 200, sent.text
         path.write_bytes(sent.content)
         return read_splats(path), sent.headers.get("X-Real2Sim-Figure")
@@ -165,3 +167,21 @@ def test_an_object_of_a_scenario_is_sent_as_edited(client, tiny_scene, tmp_path)
     assert len(person) > 1000
     unknown = client.get(f"/v1/scenarios/{made}/splats", params={"object_id": "nobody"})
     assert (unknown.status_code, unknown.json()["code"]) == (404, "UNKNOWN_OBJECT")
+
+
+def test_a_downloaded_file_is_imported_upright(client, tiny_scene):
+    """Without options in either direction."""
+    known = {"first": 0, "count": 100_000}
+    for url, name in [("/v1/scenes/tiny/splats", "street"), ("/v1/scenarios/{}/splats", "red")]:
+        made = client.post("/v1/scenarios", json={"scene": "tiny"}).json()["scenario_id"]
+        query = known if name == "street" else {"object_id": "car_red"}
+        sent = client.get(url.format(made), params=query)
+        assert sent.status_code == 200, sent.text
+        file = {"file": (f"{name}.spz", sent.content)}
+        answer = client.post("/v1/scenes", files=file)
+        assert answer.status_code == 201, answer.text
+        cloud = tiny_scene.background if name == "street" else tiny_scene.object("car_red").cloud
+        info = answer.json()
+        assert info["provenance"]["up_axis"] == "y"
+        np.testing.assert_allclose(info["extent_min"], cloud.means.amin(0), atol=1e-3)
+        np.testing.assert_allclose(info["extent_max"], cloud.means.amax(0), atol=1e-3)
