@@ -60,6 +60,10 @@ LogCameras = Annotated[
     str | None, typer.Option(help="Comma-separated cameras of the log; default: all.")
 ]
 LogEvery = Annotated[int, typer.Option(min=1, help="Use every Nth frame.")]
+PlanLimit = Annotated[
+    float,
+    typer.Option(min=0.1, max=86_400, help="Maximum time of a planner for each answer [s]."),
+]
 Follow = Annotated[
     bool,
     typer.Option(
