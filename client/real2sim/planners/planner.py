@@ -134,7 +134,7 @@ def load_planner(name: str) -> Planner:
         8.0
         >>> load_planner("cruise_control")
         Traceback (most recent call last):
-        ValueError: planner 'cruise_control' is unknown; give alpasim, ... or 'module:Class'
+        real2sim.planners.planner.UnknownPlannerError: planner 'cruise_control' is unknown; give ...
     """
     given, equals, argument = name.partition("=")
     module_name, colon, attribute = BUILT_IN.get(given, given).partition(":")
