@@ -25,7 +25,16 @@ from .follow_route import FollowRoute
 from .idm import Idm
 from .learned import LearnedPolicy
 from .pid import PidFollowRoute
-from .planner import EpisodeSummary, Needs, Planner, StageTimes, load_planner, needs_of, run_episode
+from .planner import (
+    EpisodeSummary,
+    Needs,
+    Planner,
+    StageTimes,
+    UnknownPlannerError,
+    load_planner,
+    needs_of,
+    run_episode,
+)
 
 __all__ = [
     "DepthSampling",
@@ -37,6 +46,7 @@ __all__ = [
     "PidFollowRoute",
     "Planner",
     "StageTimes",
+    "UnknownPlannerError",
     "load_planner",
     "needs_of",
     "run_episode",

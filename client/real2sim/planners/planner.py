@@ -115,6 +115,10 @@ def forward_camera(cameras: Sequence[CameraInfo]) -> str:
     return max(cameras, key=lambda camera: camera.T_vehicle_camera[0][2]).name
 
 
+class UnknownPlannerError(ValueError):
+    """No planner has this name."""
+
+
 def load_planner(name: str) -> Planner:
     """Load a planner by name: a built-in one, or ``module:Class``.
 
@@ -123,32 +127,35 @@ def load_planner(name: str) -> Planner:
     the working directory.
 
     Raises:
-        ValueError: no such module or class, or it is not a planner.
+        UnknownPlannerError: no such module or class, or it is not a planner.
 
     Examples:
         >>> load_planner("idm").speed
         8.0
         >>> load_planner("cruise_control")
         Traceback (most recent call last):
-        ValueError: planner 'cruise_control' is unknown; give alpasim, ... or 'module:Class'
+        real2sim.planners.planner.UnknownPlannerError: planner 'cruise_control' is unknown; give ...
     """
     given, equals, argument = name.partition("=")
     module_name, colon, attribute = BUILT_IN.get(given, given).partition(":")
     if not colon:
         known = ", ".join(sorted(BUILT_IN))
-        raise ValueError(f"planner {name!r} is unknown; give {known} or 'module:Class'")
+        raise UnknownPlannerError(f"planner {name!r} is unknown; give {known} or 'module:Class'")
     if (folder := str(Path.cwd())) not in sys.path:
         sys.path.insert(0, folder)
     try:
         make = getattr(importlib.import_module(module_name), attribute)
     except (ImportError, AttributeError) as error:
-        raise ValueError(f"planner {name!r} cannot be loaded: {error}") from error
+        raise UnknownPlannerError(f"planner {name!r} cannot be loaded: {error}") from error
     try:
         planner = make(argument) if equals else make()
     except TypeError as error:
-        raise ValueError(f"planner {name!r} cannot be made: {error}") from error
+        # Errors raised inside the constructor have more frames in their traceback.
+        if error.__traceback__ is None or error.__traceback__.tb_next is not None:
+            raise
+        raise UnknownPlannerError(f"planner {name!r} cannot be made: {error}") from error
     if not isinstance(planner, Planner):
-        raise ValueError(f"planner {name!r} needs the methods reset(obs) and plan(obs)")
+        raise UnknownPlannerError(f"planner {name!r} needs the methods reset(obs) and plan(obs)")
     return planner
 
 

@@ -65,6 +65,10 @@ Strict = Annotated[
     bool, typer.Option("--strict", help="Refuse a log of which anything cannot be used.")
 ]
 LogEvery = Annotated[int, typer.Option(min=1, help="Use every Nth frame.")]
+PlanLimit = Annotated[
+    float,
+    typer.Option(min=0.1, max=86_400, help="Maximum time of a planner for each answer [s]."),
+]
 Follow = Annotated[
     bool,
     typer.Option(

@@ -20,7 +20,7 @@ from ..console import (
     staged_progress,
     write_json,
 )
-from .common import Follow, JsonFile, command
+from .common import Follow, JsonFile, PlanLimit, command
 
 if TYPE_CHECKING:
     from real2sim_proto.storyboard import Storyboard
@@ -503,6 +503,7 @@ def sweep(
     ray_address: Annotated[
         str | None, typer.Option(help="Address of a Ray cluster; default: start one.")
     ] = None,
+    plan_limit: PlanLimit = 60.0,
     json: JsonFile = None,
     follow: Follow = False,
 ) -> None:
@@ -520,12 +521,15 @@ def sweep(
     try:
         who = executor_of(executor, workers=workers, address=ray_address)
         with reported_progress(follow=follow) as report:
-            figures = run_sweep(asked, out, who, scenes=scenes, on_progress=report)
+            figures = run_sweep(
+                asked, out, who, scenes=scenes, plan_limit_s=plan_limit, on_progress=report
+            )
     except ExecutorError as error:
         raise CommandError(str(error)) from error
     write_json(json, figures)
     if not follow:
-        print_figures(f"sweep of {asked.case.name}", figures)
+        shown = {name: value for name, value in figures.items() if value is not None}
+        print_figures(f"sweep of {asked.case.name}", shown)
 
 
 # --- search ---------------------------------------------------------------------------------------
@@ -549,6 +553,7 @@ def search(
         int, typer.Option(min=0, help="Episodes to estimate the failure rate; 0: none.")
     ] = 0,
     films: Annotated[int, typer.Option(min=0, help="Number of failures to film.")] = 0,
+    plan_limit: PlanLimit = 60.0,
     scenes: ScenesFolder = None,
     json: JsonFile = None,
     follow: Follow = False,
@@ -569,6 +574,7 @@ def search(
         probability=probability,
         films=films,
         scenes=scenes,
+        plan_limit_s=plan_limit,
     )
     asked = [load_space(name, scenes) for name in spaces]
     with reported_progress(follow=follow) as report:
@@ -576,6 +582,7 @@ def search(
     write_json(json, found)
     if follow:
         return
-    keys = ("episodes", "driven_now", "first_failure", "at_fault", "avoidable", "cells")
+    keys = ["episodes", "driven_now", "first_failure", "at_fault", "avoidable", "cells"]
+    keys += ["planner_failed", "first_error"] if found["planner_failed"] else []
     print_figures(f"failures of {planner}", {k: found[k] for k in keys})
     console.print(f"wrote {out / 'failures.html'} and {out / 'failures.json'}")

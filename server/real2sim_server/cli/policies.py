@@ -17,7 +17,7 @@ from rich.table import Table
 
 from .._files import atomic_file
 from ..console import CommandError, console, errors, print_figures, staged_progress, write_json
-from .common import JsonFile, LogFormat, SequenceName, command, opened_log
+from .common import JsonFile, LogFormat, PlanLimit, SequenceName, command, opened_log
 
 if TYPE_CHECKING:
     from real2sim.planners.learned import PolicyShape
@@ -89,11 +89,13 @@ def evaluate_policy(
     sessions: Annotated[
         int, typer.Option(min=1, max=64, help="Episodes to drive in parallel.")
     ] = 2,
+    plan_limit: PlanLimit = 60.0,
 ) -> None:
     """Compare planners over cases: scores, recordings and an HTML report.
 
-    Each planner runs in its own process. If a planner raises an exception, returns an invalid plan
-    or exits, this episode fails. The other episodes continue, and the exit code is 1.
+    Each planner runs in its own process. If a planner raises an exception, returns an invalid plan,
+    exits or exceeds --plan-limit, this episode fails. The other episodes continue, and the exit
+    code is 1.
 
     A suite lists cases: a scene or a scenario, options of `reset`, edits, and the `jitter` of
     numbers in them, which varies with the seed. See docs/policies.md for the format.
@@ -114,6 +116,7 @@ def evaluate_policy(
                 grid,
                 WorkerTarget(url, token, sessions),
                 out / RECORDINGS,
+                plan_limit_s=plan_limit,
                 on_progress=lambda done, count: report("drive", done, count),
             )
         except ValueError as error:

@@ -306,9 +306,10 @@ class ScoreGroup:
     Attributes:
         scores: statistics by name; None if undefined in every episode, or if the planner failed in
             any, because a mean over the others would be biased in its favour.
-        collisions, at_fault: total numbers of collisions and of at-fault collisions.
+        collisions, at_fault: total numbers of collisions and of at-fault collisions, without
+            episodes in which the planner failed.
         reasons: number of episodes by reason for the end.
-        failed: number of episodes in which the planner raised or sent an infeasible action.
+        failed: number of episodes in which the planner failed.
     """
 
     policy: str
@@ -335,8 +336,8 @@ class ScoreGroup:
             case=case,
             episodes=len(results),
             scores=scores,
-            collisions=sum(one.figures["collisions"] for one in results),
-            at_fault=sum(one.figures["at_fault"] for one in results),
+            collisions=sum(one.figures["collisions"] for one in results if one.error is None),
+            at_fault=sum(one.figures["at_fault"] for one in results if one.error is None),
             reasons=dict(Counter(one.reason for one in results)),
             failed=failed,
         )

@@ -136,7 +136,8 @@ def left_by_search(context: JobContext, scene: str) -> JobResult:
     pack(out, folder / ARCHIVE, context)
     files[ARCHIVE] = TAR
     _tidy(folder)
-    keys = ("episodes", "driven_now", "first_failure", "at_fault", "avoidable", "cells", "spaces")
+    keys = ["episodes", "driven_now", "planner_failed", "first_error", "first_failure"]
+    keys += ["at_fault", "avoidable", "cells", "spaces"]
     failures = [{name: f.get(name) for name in SUMMED_UP} for f in found["failures"]]
     return JobResult({k: found[k] for k in keys} | {"failures": failures}, files)
 

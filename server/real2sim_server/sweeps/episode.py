@@ -9,9 +9,10 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
+from importlib.machinery import PathFinder
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,14 +20,16 @@ from pydantic import TypeAdapter, ValidationError
 
 from real2sim.images import Frame
 from real2sim.observation import Observation, observation_from_wire
-from real2sim.planners import Needs, needs_of
+from real2sim.planners import Needs, load_planner, needs_of
 from real2sim_proto.drive import Obs
 from real2sim_proto.episode import ResetSpec
+from real2sim_proto.jobs import PlannerName
 from real2sim_proto.operations import Operation
 from real2sim_proto.plans import PLAN, Control, PoseCommand, TrajectoryPlan
 
 from .._numba import kernel
 from ..edit import EditError, ScenarioState
+from ..policies.planner_process import PlannerFailedError, PlannerProcesses
 from ..policies.suite import Case
 from ..render import RasterOptions, View, rasterize_batch
 from ..render.images import to_uint8
@@ -359,7 +362,7 @@ class Driven:
     Attributes:
         world: world at the end of the episode; None if it could not start.
         danger: criticality over the episode.
-        error: the reason why it could not start, or the planner's exception; None on success.
+        error: why it could not start, or why the planner failed; None on success.
         entries: contents of a recording; empty unless requested.
         worlds: worlds of all steps; empty unless requested.
     """
@@ -381,6 +384,20 @@ class Driven:
         return math.nan if self.world is None else self.danger.criticality(self.world)
 
 
+IN_PROCESS = frozenset({*get_args(PlannerName), "learned"})
+"""Planners that sweeps run in their own process, because they run no code of others."""
+
+
+def load(name: str, processes: PlannerProcesses) -> Any:
+    """A new planner, in a process of its own unless it is in :data:`IN_PROCESS`.
+
+    Raises:
+        ValueError, OSError: no such planner, or a file that it cannot read.
+    """
+    known = name.partition("=")[0] in IN_PROCESS
+    return load_planner(name) if known else processes.load(name)
+
+
 def begin(scene: Scene, drive: Drive, needs: Needs, *, privileged: bool) -> World:
     """The world of an episode at its start time, before its edits.
 
@@ -400,7 +417,7 @@ def drive_episode(
     keep_worlds: bool = False,
     on_world: Callable[[World], None] | None = None,
 ) -> Driven:
-    """Let a planner drive an episode; an exception of the planner ends it.
+    """Let a planner drive an episode; it ends if the planner fails.
 
     Edits are applied at the start time, after the planner's first observation, as in sessions of a
     worker.
@@ -408,7 +425,7 @@ def drive_episode(
     Args:
         scene: scene of the case.
         drive: the episode.
-        planner: loaded planner.
+        planner: loaded planner, see :func:`load`.
         keep_entries: keep the entries for a recording.
         keep_worlds: keep the world of each step, to continue from it.
         on_world: called with the world at every time step.
@@ -421,7 +438,7 @@ def drive_episode(
     except (WorldError, ValidationError) as error:
         return Driven(None, Danger(), f"{type(error).__name__}: {error}")
     driven = Driven(world, Danger(adversaries_of(drive.reset, drive.operations)))
-    feed = CameraFeed.of(scene, needs)
+    feed = _feed_of(scene, needs, driven)
     if keep_entries:
         driven.entries.append(Entry("reset", 0, reset_payload(world.spec)))
     obs = observation_of(world, feed)
@@ -436,7 +453,7 @@ def drive_episode(
     driven.danger.add(world)
     for show in (on_world,) if on_world else ():
         show(world)
-    while not world.over:
+    while not world.over and driven.error is None:
         try:
             if world.steps == 0:
                 planner.reset(obs)
@@ -445,7 +462,8 @@ def drive_episode(
                 driven.worlds.append(world.fork())
             world.step(plan)
         except Exception as error:  # A planner may raise anything; only its episode ends.
-            driven.error = f"{type(error).__name__}: {error}"[:500]
+            told = isinstance(error, PlannerFailedError)
+            driven.error = str(error) if told else f"{type(error).__name__}: {error}"[:500]
             break
         if keep_entries:
             driven.entries.append(Entry("action", world.steps - 1, action_payload(plan)))
@@ -454,6 +472,14 @@ def drive_episode(
             show(world)
         obs = observation_of(world, feed)
     return driven
+
+
+def _feed_of(scene: Scene, needs: Needs, driven: Driven) -> CameraFeed | None:
+    try:
+        return CameraFeed.of(scene, needs)
+    except PlannerFailedError as error:
+        driven.error = str(error)
+        return None
 
 
 def observation_of(world: World, feed: CameraFeed | None = None) -> Observation:
@@ -479,6 +505,13 @@ def _file_hash(argument: str) -> str:
 
 
 def _source_hash(module: str) -> str:
-    """Hash of the source file of a planner's module; empty if the module is not loaded from one."""
-    source = getattr(sys.modules.get(module), "__file__", None)
+    """Hash of the source file of a planner's module, found without running it; empty if there is
+    none."""
+    here, folders, source = str(Path.cwd()), list(sys.path), None
+    if here not in folders:
+        folders.insert(0, here)
+    for part in module.split("."):
+        spec = PathFinder.find_spec(part, folders)
+        source = spec.origin if spec is not None else None
+        folders = list(spec.submodule_search_locations or ()) if spec is not None else []
     return _file_hash(source) if source else ""

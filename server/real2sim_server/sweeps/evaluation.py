@@ -10,12 +10,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from real2sim.planners import Needs, load_planner
+from real2sim.planners import Needs
 from real2sim_proto.plans import TrajectoryPlan
 
+from ..policies.planner_process import PLAN_LIMIT_S, PlannerProcesses
 from ..scene import Scene
 from ..world import World
-from .episode import OPERATIONS, Drive, Driven, adversaries_of, begin, drive_episode, signed_gaps
+from .episode import (
+    OPERATIONS,
+    Drive,
+    Driven,
+    adversaries_of,
+    begin,
+    drive_episode,
+    load,
+    signed_gaps,
+)
 from .parameters import Value, drawn_parameters, values_at
 from .spec import Space
 from .sweep import Journal
@@ -369,6 +379,7 @@ class Evaluation:
         avoided: whether the reference survived the same case; None if it did not drive.
         cell: cell of the archive; None unless at fault.
         impact: columns of the collision.
+        error: why the planner failed; None if it drove to the end.
     """
 
     space: int
@@ -382,6 +393,7 @@ class Evaluation:
     avoided: bool | None
     cell: Cell | None
     impact: Mapping[str, Any] = field(default_factory=dict)
+    error: str | None = None
 
     @property
     def is_failure(self) -> bool:
@@ -398,6 +410,7 @@ class Evaluator:
         planner: name of the tested planner.
         seed: seed of the episodes.
         journal: open journal with the outcomes of episodes; None keeps none.
+        plan_limit_s: time limit for each answer of the planner [s].
     """
 
     def __init__(
@@ -408,10 +421,12 @@ class Evaluator:
         *,
         seed: int = 0,
         journal: Journal | None = None,
+        plan_limit_s: float = PLAN_LIMIT_S,
     ) -> None:
         self.scene, self.spaces, self.planner, self.seed = scene, list(spaces), planner, seed
         self.statistics = DrivingStatistics.of(scene)
         self.journal = journal
+        self._processes = PlannerProcesses(plan_limit_s)
 
     def dimensions(self, space: int) -> int:
         """Number of coordinates of a point of a space."""
@@ -435,11 +450,22 @@ class Evaluator:
         row = self.journal.rows[key]
         return row | {"cell": row["cell"] and tuple(row["cell"])}
 
+    def drive(self, drive: Drive, **options: Any) -> Driven:
+        """Let the planner drive an episode; options as for :func:`.drive_episode`."""
+        planner = load(drive.planner, self._processes)
+        return drive_episode(self.scene, drive, planner, **options)
+
+    def close(self) -> None:
+        """End the planner's process."""
+        self._processes.close()
+
     def _driven(self, drive: Drive) -> dict[str, Any]:
         watch = Watch(adversaries_of(drive.reset), self.statistics)
-        driven = drive_episode(self.scene, drive, load_planner(self.planner), on_world=watch.add)
-        if driven.world is None or driven.error is not None:
+        driven = self.drive(drive, on_world=watch.add)
+        if driven.world is None:
             return _nothing()
+        if driven.error is not None:
+            return _nothing() | {"error": driven.error}
         strange = watch.implausibility()
         score, avoided = driven.criticality - strange, None
         if driven.at_fault:

@@ -15,14 +15,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from real2sim.planners import load_planner
 from real2sim_proto.episode import ResetSpec
 
 from ..policies.page import STYLE
 from ..scene.lane import DRIVABLE
 from ..world.recording import Recording
 from ..world.scoring.instant import ScoringContext
-from .episode import Drive, Driven, drive_episode
+from .episode import Drive, Driven
 from .evaluation import Evaluation, Evaluator, impact_of
 from .parameters import Value, drawn_parameters, values_at
 from .spec import read_scenario, run_options, write_scenario_file
@@ -75,7 +74,9 @@ def _towards(
     k, name = parameter
 
     def fails(u: float) -> bool:
-        return evaluate(failure.space, _moved(failure, k, u)).at_fault
+        found = evaluate(failure.space, _moved(failure, k, u))
+        # An episode in which the planner fails shows no value to be safe.
+        return found.at_fault or found.error is not None
 
     if abs(end - failure.point[k]) < 1e-6 or fails(end):
         return None
@@ -153,7 +154,7 @@ def write_scenario(
         (folder / source.file).unlink()
         return None
     planner = found.drive.planner
-    again = drive_episode(evaluate.scene, Drive(planner, options), load_planner(planner))
+    again = evaluate.drive(Drive(planner, options))
     file = f"{folder.name}/{source.file}"
     command = ["real2sim", "run", file, scene, "--planner", planner]
     command += ["--seconds", f"{seconds / 10:g}", "--seed", str(seed)]
@@ -289,7 +290,17 @@ def render_page(report: Mapping[str, Any], failures: Sequence[Failure]) -> str:
 
 
 def _summary(report: Mapping[str, Any]) -> str:
-    found, episodes = report["failures"], report["episodes"]
+    if not report["planner_failed"]:
+        return _driving(report)
+    return (
+        f'<p class="big">The planner itself failed in {report["planner_failed"]} of '
+        f"{report['episodes']} episodes, which say nothing about its driving; first: "
+        f"{escape(report['first_error'])}.</p>{_driving(report)}"
+    )
+
+
+def _driving(report: Mapping[str, Any]) -> str:
+    found, episodes = report["failures"], report["episodes"] - report["planner_failed"]
     spaces = ", ".join(escape(s["name"]) for s in report["spaces"])
     if not found:
         return (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import math
@@ -13,21 +14,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from real2sim.planners import load_planner, needs_of
-
 from .._files import atomic_file
 from ..console import CommandError
 from ..policies.page import film_episode
+from ..policies.planner_process import PLAN_LIMIT_S
 from ..scene import Scene
 from ..scene.io import open_scene
 from ..world.recording import first_difference, save_recording
-from .episode import CameraFeed, Driven, drive_episode, recording_of
+from .episode import Driven, recording_of
 from .evaluation import REFUSED, Evaluation, Evaluator, drive_reference
 from .failure import Failure, boundaries, render_page, write_scenario
 from .optimise import SearchBudget, SearchState, search
 from .parameters import drawn_parameters
 from .spec import Space
-from .sweep import open_journal
+from .sweep import check_planners, open_journal
 
 # --- Statistics ----------------------------------------------------------------------------------
 
@@ -184,6 +184,7 @@ class SearchOptions:
         films: number of failures, worst first, to film.
         film_width: width of films [px].
         scenes: folder of bundles.
+        plan_limit_s: time limit for each answer of the planner [s].
     """
 
     budget: SearchBudget = field(default_factory=SearchBudget)
@@ -192,6 +193,7 @@ class SearchOptions:
     films: int = 0
     film_width: int = 480
     scenes: Path | None = None
+    plan_limit_s: float = PLAN_LIMIT_S
 
 
 def run_search(
@@ -215,11 +217,12 @@ def run_search(
     """
     options = options or SearchOptions()
     scene = _scene_of(spaces, options.scenes)
-    _check_planner(planner, scene)
+    limit_s = options.plan_limit_s
+    check_planners([planner], scene, limit_s)
     journal = open_journal(out / JOURNAL)
     known = len(journal.rows)
-    with journal:
-        evaluate = Evaluator(scene, spaces, planner, journal=journal)
+    evaluate = Evaluator(scene, spaces, planner, journal=journal, plan_limit_s=limit_s)
+    with journal, contextlib.closing(evaluate):
         state = search(
             evaluate, options.budget, on_progress=lambda d, t: on_progress("search", d, t)
         )
@@ -246,25 +249,12 @@ def _scene_of(spaces: Sequence[Space], folder: Path | None) -> Scene:
     return open_scene(names[0], folder)
 
 
-def _check_planner(planner: str, scene: Scene) -> None:
-    try:
-        CameraFeed.of(scene, needs_of(load_planner(planner)))
-    except (ValueError, OSError) as error:
-        raise CommandError(f"planner {planner!r}: {error}") from error
-
-
 def _failure(
     evaluate: Evaluator, found: Evaluation, number: int, out: Path, options: SearchOptions
 ) -> Failure:
     """Record a failure, write its scenario file, shrink it and film it."""
     name = f"failure_{number + 1:02d}"
-    driven = drive_episode(
-        evaluate.scene,
-        found.drive,
-        load_planner(found.drive.planner),
-        keep_entries=True,
-        keep_worlds=True,
-    )
+    driven = evaluate.drive(found.drive, keep_entries=True, keep_worlds=True)
     recording = recording_of(evaluate.scene, driven)
     save_recording(recording, out / "recordings" / f"{name}.r2e")
     case = evaluate.spaces[found.space].case_at(found.values)
@@ -320,11 +310,15 @@ def _probabilities(
     found: list[Probability | None] = []
     rng = np.random.default_rng([options.budget.seed, 1])
     for space in range(len(evaluate.spaces)):
-        dimensions, failures = evaluate.dimensions(space), 0
+        dimensions, failures, episodes = evaluate.dimensions(space), 0, 0
         for k in range(options.probability):
-            failures += evaluate(space, rng.random(dimensions)).at_fault
+            one = evaluate(space, rng.random(dimensions))
+            failures, episodes = failures + one.at_fault, episodes + (one.error is None)
             on_progress("probability", k + 1, options.probability)
-        odds = wilson(failures, options.probability)
+        if not episodes:
+            found.append(None)
+            continue
+        odds = wilson(failures, episodes)
         if failures == 0:
             rare = splitting(
                 lambda u, space=space: _danger(evaluate(space, u)),  # type: ignore[misc]
@@ -352,6 +346,7 @@ def _report(
 ) -> dict[str, Any]:
     """Contents of failures.json."""
     at_fault = [e for e in state.evaluations if e.at_fault]
+    errors = [e.error for e in state.evaluations if e.error is not None]
     return {
         "format": "real2sim-failures",
         "version": 1,
@@ -360,6 +355,8 @@ def _report(
         "scene_hash": evaluate.scene.content_hash,
         "seed": options.budget.seed,
         "episodes": len(state.evaluations),
+        "planner_failed": len(errors),
+        "first_error": errors[0] if errors else None,
         "first_failure": state.archive.first,
         "at_fault": len(at_fault),
         "avoidable": sum(e.is_failure for e in at_fault),

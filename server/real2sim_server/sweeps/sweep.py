@@ -13,18 +13,19 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, TYPE_CHECKING, Any, Self
 
-from real2sim.planners import load_planner, needs_of
+from real2sim.planners import needs_of
 from real2sim_proto.sweeps import StopRule
 
 from .._files import atomic_file
 from ..console import CommandError
 from ..executors import Executor, Recipe
+from ..policies.planner_process import PLAN_LIMIT_S, PlannerFailedError, PlannerProcesses
 from ..scene import Scene
 from ..scene.io import open_scene
 from ..world import warm_up
 from ..world.recording import save_recording
 from ..world.scoring import metrics_version
-from .episode import CameraFeed, Drive, Driven, drive_episode, recording_of
+from .episode import CameraFeed, Drive, Driven, drive_episode, load, recording_of
 from .parameters import Choice, IntRange, Value, drawn_parameters, points_of, values_at
 from .spec import SweepSpec, write_scenario_file
 
@@ -191,11 +192,18 @@ COLUMNS: Mapping[str, type] = {
     "impact_kind": str,
 }
 """Measured columns of every episode, without wall-clock times, to keep tables comparable."""
+PLANNER_FAILED = "planner failed"
+"""Reason of an episode that ended because of the planner itself, and not of its driving."""
 
 
-def recipe_of(scene: str, scenes: Path | None, metrics: Sequence[str] = ()) -> Recipe:
-    """A factory of workers for a scene; see :func:`~..scene.io.open_scene`."""
-    return partial(EpisodeWorker, scene, scenes, tuple(metrics))
+def recipe_of(
+    scene: str,
+    scenes: Path | None,
+    metrics: Sequence[str] = (),
+    plan_limit_s: float = PLAN_LIMIT_S,
+) -> Recipe:
+    """A factory of workers for a scene; arguments as for :class:`EpisodeWorker`."""
+    return partial(EpisodeWorker, scene, scenes, tuple(metrics), plan_limit_s)
 
 
 class EpisodeWorker:
@@ -204,11 +212,17 @@ class EpisodeWorker:
     Args:
         scene, scenes: as for :func:`~..scene.io.open_scene`.
         metrics: scores to add as columns.
+        plan_limit_s: time limit for each answer of a planner [s].
         threads: number of threads.
     """
 
     def __init__(
-        self, scene: str, scenes: Path | None, metrics: Sequence[str], threads: int
+        self,
+        scene: str,
+        scenes: Path | None,
+        metrics: Sequence[str],
+        plan_limit_s: float,
+        threads: int,
     ) -> None:
         import numba
         import torch
@@ -218,10 +232,11 @@ class EpisodeWorker:
         warm_up()
         self._scene = open_scene(scene, scenes)
         self._metrics = metrics
+        self._processes = PlannerProcesses(plan_limit_s, threads=threads)
 
     def make(self, task: Drive) -> Row:
         """The row of an episode."""
-        driven = drive_episode(self._scene, task, load_planner(task.planner))
+        driven = drive_episode(self._scene, task, load(task.planner, self._processes))
         return row_of(driven, self._metrics)
 
 
@@ -235,7 +250,7 @@ def row_of(driven: Driven, metrics: Sequence[str] = ()) -> Row:
     last = world.accumulator
     scores = {s.name: s.value for s in world.scores()} if metrics else {}
     return row | {
-        "reason": "planner failed" if driven.error else world.reason or "over",
+        "reason": PLANNER_FAILED if driven.error else world.reason or "over",
         "steps": world.steps,
         "seconds": world.steps * world.context.dt,
         "distance": last.distance,
@@ -311,6 +326,7 @@ def run_sweep(
     executor: Executor,
     *,
     scenes: Path | None = None,
+    plan_limit_s: float = PLAN_LIMIT_S,
     on_progress: Report = lambda _stage, _done, _total: None,
 ) -> dict[str, Any]:
     """Drive a sweep and write it to a folder; episodes that are already there are skipped.
@@ -323,11 +339,13 @@ def run_sweep(
         out: folder of ``episodes.parquet``, ``recordings/``, ``scenarios/`` and the journal.
         executor: runs the episodes.
         scenes: folder of bundles, at the same path for every worker.
+        plan_limit_s: time limit for each answer of a planner [s].
         on_progress: called with (stage, done, all).
 
     Returns:
-        Figures: numbers of episodes, newly driven episodes, collisions and at-fault collisions, and
-        the keys of the worst episodes.
+        Figures: numbers of episodes, newly driven episodes, collisions and at-fault collisions of
+        the episodes without an error, and episodes in which the planner failed; and the keys of
+        the worst episodes.
 
     Raises:
         CommandError: no such scene, planner, score or column.
@@ -335,9 +353,9 @@ def run_sweep(
     """
     assert spec.case.scene is not None
     scene = open_scene(spec.case.scene, scenes)
-    _check(spec, scene)
+    _check(spec, scene, plan_limit_s)
     planned = planned_episodes(spec, scene.content_hash or "")
-    recipe = recipe_of(spec.case.scene, scenes, spec.metrics)
+    recipe = recipe_of(spec.case.scene, scenes, spec.metrics, plan_limit_s)
     journal = open_journal(out / JOURNAL)
     known = len(journal.rows)
     with journal:
@@ -357,18 +375,23 @@ def run_sweep(
     rows = [e.columns() | journal.rows[e.key] for e in episodes]
     write_table(out / TABLE, rows, column_types(spec))
     worst = _worst(episodes, rows, spec)
-    for done, episode in enumerate(worst, start=1):
-        _record(scene, episode.drive, out / RECORDINGS / f"{episode.key}.r2e")
-        if spec.storyboard is not None:
-            read = spec.storyboard.read(episode.values)
-            write_scenario_file(_made(out / SCENARIOS), episode.key, read, spec.storyboard.source)
-        on_progress("recordings", done, len(worst))
+    with PlannerProcesses(plan_limit_s) as processes:
+        for done, episode in enumerate(worst, start=1):
+            _record(scene, episode.drive, out / RECORDINGS / f"{episode.key}.r2e", processes)
+            if spec.storyboard is not None:
+                read, source = spec.storyboard.read(episode.values), spec.storyboard.source
+                write_scenario_file(_made(out / SCENARIOS), episode.key, read, source)
+            on_progress("recordings", done, len(worst))
+    driven = [r for r in rows if r["error"] is None]
+    failed = [r for r in rows if r["reason"] == PLANNER_FAILED]
     return {
         "episodes": len(rows),
         "driven now": len(journal.rows) - known,
-        "collisions": sum(bool(r["collisions"]) for r in rows),
-        "at fault": sum(bool(r["at_fault"]) for r in rows),
-        "errors": sum(r["error"] is not None for r in rows),
+        "collisions": sum(bool(r["collisions"]) for r in driven),
+        "at fault": sum(bool(r["at_fault"]) for r in driven),
+        "errors": len(rows) - len(driven),
+        "planner failed": len(failed),
+        "first error": f"{failed[0]['planner']}: {failed[0]['error']}" if failed else None,
         "worst": [episode.key for episode in worst],
         "table": str(out / TABLE),
     }
@@ -415,7 +438,23 @@ def column_types(spec: SweepSpec) -> dict[str, type]:
     return {**types, "episode": str, **COLUMNS, **scores}
 
 
-def _check(spec: SweepSpec, scene: Scene) -> None:
+def check_planners(planners: Sequence[str], scene: Scene, plan_limit_s: float) -> None:
+    """Check that sweeps can drive planners in a scene. A planner that fails is no error here.
+
+    Raises:
+        CommandError: an unknown planner, or one whose cameras or modalities are not available.
+    """
+    with PlannerProcesses(plan_limit_s) as processes:
+        for planner in planners:
+            try:
+                CameraFeed.of(scene, needs_of(load(planner, processes)))
+            except (ValueError, TypeError, OSError) as error:
+                raise CommandError(f"planner {planner!r}: {error}") from error
+            except PlannerFailedError:
+                continue
+
+
+def _check(spec: SweepSpec, scene: Scene, plan_limit_s: float) -> None:
     known = {part.partition("@")[0] for part in metrics_version().replace(",", " ").split()}
     if unknown := [name for name in spec.metrics if name not in known]:
         raise CommandError(f"no score {unknown[0]!r}; there are {', '.join(sorted(known))}")
@@ -426,11 +465,7 @@ def _check(spec: SweepSpec, scene: Scene) -> None:
     taken = set(COLUMNS) | {"point", "planner", "seed", "weight", "episode"}
     if twice := sorted(taken & set(spec.parameters)):
         raise CommandError(f"parameter {twice[0]!r} has the name of a column; give it another")
-    for planner in spec.planners:
-        try:
-            CameraFeed.of(scene, needs_of(load_planner(planner)))
-        except (ValueError, OSError) as error:
-            raise CommandError(f"planner {planner!r}: {error}") from error
+    check_planners(spec.planners, scene, plan_limit_s)
 
 
 def _parts(planned: list[PlannedEpisode], stop: StopRule | None) -> Iterator[list[PlannedEpisode]]:
@@ -446,8 +481,8 @@ def _enough(planned: list[PlannedEpisode], rows: Mapping[str, Row], stop: StopRu
     for number, episode in enumerate(planned, start=1):
         if (row := rows.get(episode.key)) is None:
             return None
-        at_fault += bool(row["at_fault"])
-        collisions += bool(row["collisions"])
+        at_fault += row["error"] is None and bool(row["at_fault"])
+        collisions += row["error"] is None and bool(row["collisions"])
         limits = ((stop.at_fault, at_fault), (stop.collisions, collisions), (stop.episodes, number))
         if any(most is not None and count >= most for most, count in limits):
             return number
@@ -467,10 +502,12 @@ def _worst(
     return [episodes[k] for k in ranked[: spec.worst]]
 
 
-def _record(scene: Scene, drive: Drive, path: Path) -> None:
+def _record(scene: Scene, drive: Drive, path: Path, processes: PlannerProcesses) -> None:
     """Create a recording by driving the episode again, with bit-identical results."""
-    if not path.exists():
-        driven = drive_episode(scene, drive, load_planner(drive.planner), keep_entries=True)
+    if path.exists():
+        return
+    driven = drive_episode(scene, drive, load(drive.planner, processes), keep_entries=True)
+    if driven.error is None:
         save_recording(recording_of(scene, driven), path)
 
 

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import contextlib
 import html
 import json
 import re
@@ -18,6 +19,7 @@ from real2sim_server.policies.page import (
 )
 from real2sim_server.world.recording import load_recording
 from real2sim_server.world.scoring import METRICS
+from tests.server.planners import ALL, AND_LIMITS, none_left_running
 
 pytestmark = pytest.mark.network
 
@@ -130,35 +132,44 @@ class Early(Bad):
     def begin(self, welcome): os._exit(4)
 """
 FAILURES = {
-    "bad:Exits": "the planner ended its process with exit code 3",
+    "bad:Exits": "the planner ended with exit code 3 at step 9",
     "bad:Leaves": "SystemExit: no more",
     "bad:Refused": "plan refused: plan: pose/x",
     "bad:Other": "plan refused: ",
     "bad:Nothing": "plan refused: plan: ",
-    "bad:Early": "the planner ended its process with exit code 4",
+    "bad:Early": "the planner ended with exit code 4 in begin",
 }
 
 
 @pytest.mark.slow
-def test_failing_planners_are_reported_and_the_others_driven(site, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("failures", "limit_s"),
+    [(FAILURES, 60.0), *(({ALL[k]: r for k, r in rs.items()}, s) for rs, s in AND_LIMITS)],
+    ids=["own file", "misbehave", "never answer"],
+)
+def test_failing_planners_are_reported_and_the_others_driven(
+    failures, limit_s, site, tmp_path, monkeypatch
+):
     (tmp_path / "bad.py").write_text(BAD)
     monkeypatch.chdir(tmp_path)
     out = tmp_path / "out"
     command = ["evaluate-policy", "--scene", "tiny", "--url", site.url, "--out", str(out)]
-    policies = [word for name in (*FAILURES, "pid") for word in ("--policy", name)]
-    done = CliRunner().invoke(build_app(), [*command, *policies, "--sessions", "1"])
+    command += ["--plan-limit", str(limit_s), "--sessions", "1", "--policy", "pid"]
+    policies = [word for name in failures for word in ("--policy", name)]
+    alive = none_left_running(tmp_path) if failures is not FAILURES else contextlib.nullcontext()
+    with alive:
+        done = CliRunner().invoke(build_app(), [*command, *policies])
     assert done.exit_code == 1, done.output
     figures = json.loads((out / "report.json").read_text())
     episodes = {e["policy"]: e for e in figures["episodes"]}
     assert (episodes["pid"]["error"], episodes["pid"]["reason"]) == (None, "horizon")
     page = (out / "report.html").read_text()
-    for name, reason in FAILURES.items():
+    for name, reason in failures.items():
         error = episodes[name]["error"]
         assert error.startswith(reason)
         assert error in html.unescape(page)
-        assert f"planner {name} failed in 1 of 1 episodes, first in tiny, seed 0: {error}" in (
-            done.output
-        )
+        told = f"planner {name} failed in 1 of 1 episodes, first in tiny, seed 0: {error}"
+        assert told in done.output
         assert load_recording(out / episodes[name]["recording"]).instants
     with real2sim.connect(site.url, token=site.token) as client:
         assert client.sessions.list() == []

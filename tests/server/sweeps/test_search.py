@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import re
@@ -57,6 +58,9 @@ from real2sim_server.sweeps.spec import SHIPPED_SPACES, Space, load_space
 from real2sim_server.sweeps.sweep import Journal
 from real2sim_server.world.recording import first_difference, load_recording
 from real2sim_server.world.scoring.road import RoadMap
+from tests.server.planners import ALL, AND_LIMITS, REASONS, none_left_running
+
+SLOW = pytest.mark.slow
 
 BRAKES = Space.model_validate(
     {
@@ -337,15 +341,47 @@ def test_a_killed_search_ends_with_the_same_files_when_it_is_run_again(
 
 
 def test_episodes_of_a_changed_planner_are_not_taken_from_the_journal(tmp_path, monkeypatch):
-    keys = []
-    for speed in (5.0, 6.0):
-        source = tmp_path / f"{speed:g}" / "own_planner.py"
-        source.parent.mkdir()
-        source.write_text(f"class Own:\n    speed = {speed}\n")
-        module = SimpleNamespace(__file__=str(source))
-        monkeypatch.setitem(sys.modules, "own_planner", module)
-        keys.append(Drive("own_planner:Own", {}).key(""))
-    assert keys[0] != keys[1]
+    keys = set()
+    for name in ("own_planner", "own.deep.planner"):
+        for speed in (5.0, 6.0):
+            source = tmp_path / f"{speed:g}" / f"{name.replace('.', '/')}.py"
+            source.parent.mkdir(parents=True, exist_ok=True)
+            source.write_text(f"class Own:\n    speed = {speed}\n")
+            monkeypatch.chdir(tmp_path / f"{speed:g}")
+            keys.add(Drive(f"{name}:Own", {}).key(""))
+    assert len(keys) == 4
+
+
+@pytest.mark.parametrize(
+    ("failures", "limit_s"),
+    [({"Exits": REASONS["Exits"]}, 60.0), *(pytest.param(*a, marks=SLOW) for a in AND_LIMITS)],
+    ids=["exits", "misbehave", "never answer"],
+)
+def test_a_search_counts_failures_of_the_planner_itself_apart(
+    failures, limit_s, scene_folder, tmp_path
+):
+    options = SearchOptions(
+        SearchBudget(2), probability=1, scenes=scene_folder, plan_limit_s=limit_s
+    )
+    for name, reason in failures.items():
+        out = tmp_path / name
+        out.mkdir()
+        with none_left_running(out):
+            run_search([BRAKES], ALL[name], out, options)
+        report = json.loads((out / FAILURES).read_text())
+        assert (report["planner_failed"], report["at_fault"], report["failures"]) == (2, 0, [])
+        assert report["first_error"].startswith(reason)
+        assert report["spaces"][0]["probability"] is None
+        assert "The planner itself failed in 2 of 2 episodes" in (out / PAGE).read_text()
+
+
+def test_a_value_at_which_the_planner_itself_fails_is_no_safe_one(scene, evaluate):
+    point = (1.0, 1.0)
+    failure = evaluate(0, point)
+    broken = Evaluator(scene, [BRAKES], ALL["CannotReset"])
+    with contextlib.closing(broken):
+        assert failure.at_fault
+        assert boundaries(broken, failure) == []
 
 
 def test_another_file_is_not_overwritten_as_a_journal_of_a_search(scene_folder, tmp_path):

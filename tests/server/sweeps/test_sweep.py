@@ -28,7 +28,9 @@ from real2sim_server.sweeps import load_sweep, run_sweep
 from real2sim_server.sweeps.episode import signed_gaps
 from real2sim_server.sweeps.sweep import FORMAT, JOURNAL, RECORDINGS, TABLE, Journal
 from real2sim_server.world.recording import first_difference, load_recording
+from tests.server.planners import ALL, AND_LIMITS, REASONS, none_left_running
 
+SLOW = pytest.mark.slow
 SWEEP = {
     "case": {
         "name": "brakes",
@@ -186,6 +188,31 @@ def test_an_episode_that_cannot_start_gets_a_row_with_the_reason(tmp_path, scene
     assert figures["errors"] == len(rows) == 4
     assert rows[0]["reason"] == "refused"
     assert "start_us" in rows[0]["error"]
+
+
+@pytest.mark.parametrize(
+    ("failures", "limit_s"),
+    [({"Exits": REASONS["Exits"]}, 60.0), *(pytest.param(*a, marks=SLOW) for a in AND_LIMITS)],
+    ids=["exits", "misbehave", "never answer"],
+)
+def test_planners_that_misbehave_fail_in_their_own_rows(failures, limit_s, scene_folder, tmp_path):
+    path, own = tmp_path / "sweep.yaml", "real2sim.planners.pid:PidFollowRoute"
+    planners = [*(ALL[name] for name in failures), "pid", *([own] if limit_s > 1 else [])]
+    one = {"method": {"kind": "sobol", "count": 1}, "planners": planners}
+    path.write_text(yaml.safe_dump(SWEEP | one))
+    out, sweep = tmp_path / "out", load_sweep(path)
+    with none_left_running(tmp_path):
+        figures = run_sweep(sweep, out, InProcess(), scenes=scene_folder, plan_limit_s=limit_s)
+    rows = {row["planner"]: row for row in pq.read_table(out / TABLE).to_pylist()}
+    assert figures["planner failed"] == figures["errors"] == len(failures)
+    first = next(iter(failures))
+    assert figures["first error"] == f"{ALL[first]}: {rows[ALL[first]]['error']}"
+    for name, reason in failures.items():
+        assert rows[ALL[name]]["reason"] == "planner failed"
+        assert rows[ALL[name]]["error"].startswith(reason)
+    good = [{**rows[n], "planner": None, "episode": None} for n in planners[len(failures) :]]
+    assert all(row == good[0] for row in good)
+    assert good[0]["error"] is None
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
@@ -12,10 +13,11 @@ from real2sim_proto.sweeps import SweepRequest
 from real2sim_server.executors import InProcess
 from real2sim_server.scenarios.gallery import corner_case
 from real2sim_server.scenarios.openscenario import read_openscenario_text, write_openscenario
-from real2sim_server.service import drives
+from real2sim_server.service import drives, sweeps
 from real2sim_server.service.sweeps import write_spec
 from real2sim_server.sweeps import load_sweep, run_sweep
 from real2sim_server.world.recording import recording_of_bytes
+from tests.server.planners import ALL, AND_LIMITS, none_left_running
 from tests.waiting import wait_until
 
 from ..waiting import finished
@@ -116,6 +118,33 @@ def test_a_search_saves_its_failures_and_an_archive(client, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("limited", AND_LIMITS, ids=["misbehave", "never answer"])
+def test_planners_that_misbehave_do_not_end_their_job(client, limited, monkeypatch, tmp_path):
+    """Jobs only take planners of the SDK, so others are written into what the job reads."""
+    reasons, limit_s = limited
+    command = sweeps._command
+
+    def with_planners(request, folder, scene):
+        write_spec(request, folder, scene)
+        spec = json.loads((folder / sweeps.SPEC).read_text())
+        spec["planners"] = [*(ALL[name] for name in reasons), "idm"]
+        (folder / sweeps.SPEC).write_text(json.dumps(spec))
+
+    monkeypatch.chdir(Path(__file__).parents[4])
+    monkeypatch.setattr(sweeps, "write_spec", with_planners)
+    monkeypatch.setattr(sweeps, "_command", lambda *a: [*command(*a), "--plan-limit", str(limit_s)])
+    with none_left_running(tmp_path):
+        job = over(client, begun(client, method={"kind": "sobol", "count": 1}))
+    assert job["state"] == "succeeded", job["error"]["detail"]
+    assert job["result"]["planner_failed"] == len(reasons)
+    rows = pq.read_table(io.BytesIO(left(client, job, "episodes.parquet"))).to_pylist()
+    errors = {row["planner"]: row["error"] for row in rows}
+    assert errors.pop("idm") is None
+    assert all(errors[ALL[name]].startswith(reason) for name, reason in reasons.items())
+    assert client.get("/v1/sessions").json()["sessions"] == []
+
+
+@pytest.mark.slow
 def test_a_sweep_can_be_cancelled(client):
     job = begun(client, method={"kind": "sobol", "count": 400})
     wait_driving(client, job)
@@ -152,6 +181,7 @@ REFUSED = (
     ({"corner_case": "cut_off"}, "cut_off"),
     ({"scene": "nowhere"}, "no scene 'nowhere'"),
     ({"planners": ["learned=/etc/passwd"]}, "planners"),
+    ({"planners": ["os:system"]}, "planners"),
     ({"method": {"kind": "sobol", "count": 10_000}}, "20000 episodes"),
     ({"reset": {"seed": 3}}, "reset names 'seed'"),
     ({"parameters": {}}, "nothing would vary"),
