@@ -353,9 +353,10 @@ def read_proto(path: Path) -> None:
 
 
 def read_records(path: Path) -> None:
+    from real2sim_server.logs.readers.common import LeftOut
     from real2sim_server.logs.readers.waymo_v1 import list_records, read_record
 
-    for record in list_records(path):
+    for record in list_records(path, LeftOut()):
         read_record(path, record)
 
 
@@ -576,7 +577,8 @@ def as_it_is(sample: Callable[[Path], list[Parts]]) -> Callable[[Path], list[Par
 
 def log_target(name: str, drive: Path) -> Target:
     """A log reader for a drive in its layout. ``drive`` is damaged in place."""
-    from real2sim_server.logs import LogError, open_log
+    from real2sim_server.logs import LogError, check_log, open_log
+    from real2sim_server.logs.check import leave_out
 
     files = sorted(p for p in drive.rglob("*") if p.is_file())
     valid = {str(p.relative_to(drive)): p.read_bytes() for p in files}
@@ -591,8 +593,17 @@ def log_target(name: str, drive: Path) -> Target:
     def read(path: Path) -> None:
         try:
             log = open_log(path, format=name)
-            log.lidar(0)
-            log.image(log.rig.names[0], 0)
+            log = leave_out(log, check_log(log))
+            told = {kind: len(sentences) for kind, sentences in log.left_out.items()}
+            if "cameras" not in told:
+                assert told.get("images", 0) == len(log.absent_images)
+            if "LiDARs" not in told:
+                assert told.get("sweeps", 0) == len(log.absent_sweeps)
+            for frame in range(log.frame_count):
+                log.lidar(frame)
+                for camera in log.rig.names:
+                    if log.has_image(camera, frame):
+                        log.image(camera, frame)
         finally:
             for path_of in list(changed):
                 (drive / path_of).write_bytes(valid[path_of])

@@ -35,7 +35,7 @@ from real2sim_proto.drive import Envelope, EventType, ServerEnvelope
 from real2sim_proto.schema import MODELS
 from real2sim_server.datasets.writers import WRITERS
 from real2sim_server.demo.street import unpack_street
-from real2sim_server.logs import open_log
+from real2sim_server.logs import LogError, open_log
 from real2sim_server.maps import read_map
 from real2sim_server.render.modalities import unregister
 from real2sim_server.scene import GaussianCloud, Trajectory
@@ -80,12 +80,13 @@ def test_log_format(page: Callable[[str], Page]) -> None:
         told = formats.shell("--check").splitlines()
         assert len(list((formats.folder / "pictures").iterdir())) == 4
         assert told[-1] == "no problems found"
-        assert told[-2].endswith("contents of 5 images and 5 sweeps read")
-        damaged = formats.block("problem")
+        assert told[-2].endswith("5 images and 5 sweeps read")
+        damaged = formats.block("left out  sweeps")
         damage(formats.folder / "my_drive/lidar")
         shown = command("log-info", "my_drive", "--check", code=1)
         assert without_numbers(damaged) in without_numbers(shown)
-        formats.python("inspect_log")
+        with pytest.raises(LogError, match="2 of 5 frames lack an image, a sweep or a pose"):
+            formats.python("usable_log")
 
 
 def write_log(folder: Path, document: dict[str, Any]) -> None:

@@ -444,6 +444,6 @@ def _scenario(
     ego: str | None,
     leave_out: Sequence[str],
 ) -> dict[str, Any]:
-    text = openscenario.read_text("utf-8") if isinstance(openscenario, Path) else openscenario
+    text = openscenario.read_text("utf-8-sig") if isinstance(openscenario, Path) else openscenario
     given = {"corner_case": corner_case, "openscenario": text, "storyboard": storyboard}
     return {**given, "ego": ego, "leave_out": list(leave_out)}

@@ -203,7 +203,9 @@ def _edit_new(
 
 
 def _read(path: Path) -> list[Any]:
-    text = typer.get_text_stream("stdin").read() if str(path) == "-" else path.read_text("utf-8")
+    text = (
+        typer.get_text_stream("stdin").read() if str(path) == "-" else path.read_text("utf-8-sig")
+    )
     try:
         batch = json.loads(text)
     except ValueError as error:

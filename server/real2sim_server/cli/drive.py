@@ -163,6 +163,7 @@ def _storyboard(file: str, options: ReadOptions) -> tuple[Storyboard, Path | Non
     """The named storyboard, its road file, and elements without effect."""
     from real2sim_proto.storyboard import Storyboard
 
+    from .._files import read_text
     from ..scenarios import ScenarioError
     from ..scenarios.gallery import corner_case
     from ..scenarios.openscenario import read_openscenario
@@ -170,8 +171,8 @@ def _storyboard(file: str, options: ReadOptions) -> tuple[Storyboard, Path | Non
     try:
         if file.startswith("gallery:"):
             return corner_case(file).storyboard(**options.parameters), None, ()
-        if file.endswith(".json"):
-            fields = json_format.loads(Path(file).read_text(encoding="utf-8"))
+        if file.lower().endswith(".json"):
+            fields = json_format.loads(read_text(Path(file)))
             fields["parameters"] = {**fields.get("parameters", {}), **options.parameters}
             return Storyboard.model_validate(fields), None, ()
         found = read_openscenario(Path(file), options)

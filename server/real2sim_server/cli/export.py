@@ -537,7 +537,7 @@ def _numbers(option: str, text: str, allowed: tuple[str, ...]) -> dict[str, floa
 
 def _lidar(name: str | None) -> str | dict[str, Any] | None:
     """A name of the catalogue unchanged, or the values in a file."""
-    if name is None or not name.endswith(".json"):
+    if name is None or not name.lower().endswith(".json"):
         return name
     try:
         values: dict[str, Any] = json_module.loads(Path(name).read_bytes())

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from .._files import atomic_file
+from .._files import atomic_file, read_text
 from ..console import CommandError, console, print_figures, progress, staged_progress, write_json
 from .common import JsonFile, SceneBundle, command
 
@@ -332,7 +332,7 @@ def _read(path: Path | None) -> Observations:
     if path is None:
         return Observations(recorded=True)
     try:
-        document = json.loads(path.read_text("utf-8"))
+        document = json.loads(read_text(path))
         for image in document.get("images", []):
             if "file" in image:
                 data = (path.parent / image.pop("file")).read_bytes()

@@ -22,7 +22,7 @@ def left_out_lines(left_out: Mapping[str, Sequence[str]]) -> list[str]:
     """What a log leaves out: for each kind a line with the number, then the first five."""
     lines = []
     for kind, sentences in left_out.items():
-        lines.append(f"{len(sentences)} {kind}:")
+        lines.append(f"{kind}: {len(sentences)}")
         lines += [f"  {sentence}" for sentence in sentences[:NAMED]]
         if len(sentences) > NAMED:
             lines.append(f"  and {len(sentences) - NAMED} more")

@@ -29,7 +29,7 @@ class NativeMapReader:
         """Whether the path is a document of lanes, or a folder with ``lanes.json``."""
         if path.is_dir():
             return (path / NAME).is_file()
-        return path.suffix == ".json" and b'"real2sim-lanes"' in head_of(path)
+        return path.suffix.lower() == ".json" and b'"real2sim-lanes"' in head_of(path)
 
     def read(self, path: Path) -> LaneGraph:
         """The lanes of the document. Raises MapError: see :class:`~.reader.MapReader`."""

@@ -21,6 +21,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from real2sim_proto.episode import Randomization, ResetSpec
 from real2sim_proto.operations import Operation
 
+from .._files import read_text
 from ..console import CommandError
 
 SHIPPED_SUITES = Path(__file__).with_name("suites")
@@ -117,7 +118,7 @@ def load_suite(suite: str | Path) -> list[Case]:
     if not path.exists() and shipped.is_file():
         path = shipped
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(read_text(path))
         return _checked([Case.model_validate(case) for case in content["cases"]])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise CommandError(f"{path} is not a suite: {_sentence(error)}") from error

@@ -27,6 +27,7 @@ from real2sim_proto.sensors import (
     TableBeams,
 )
 
+from .._files import read_text
 from ..geometry import Float, is_rigid
 from .errors import LidarError, RadarError
 
@@ -294,7 +295,7 @@ def find_lidar(name: str) -> Lidar:
     Raises:
         LidarError: an unknown name, or a file without a LiDAR.
     """
-    return read_lidar(name) if name.endswith(".json") else catalogue_lidar(name)
+    return read_lidar(name) if name.lower().endswith(".json") else catalogue_lidar(name)
 
 
 def read_lidar(path: str | PathLike[str]) -> Lidar:
@@ -309,7 +310,7 @@ def read_lidar(path: str | PathLike[str]) -> Lidar:
             raise LidarError(
                 f"{file}: {file.stat().st_size:,} bytes; at most {MAX_LIDAR_FILE_BYTES:,}"
             )
-        values = json.loads(file.read_text(encoding="utf-8"))
+        values = json.loads(read_text(file))
     except (OSError, ValueError, RecursionError) as error:
         raise LidarError(f"{file}: no readable JSON file: {error}") from error
     try:

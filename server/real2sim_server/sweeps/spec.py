@@ -26,7 +26,7 @@ from real2sim_proto.storyboard import (
 )
 from real2sim_proto.sweeps import SpreadMethod, StopRule, with_kinds
 
-from .._files import atomic_file
+from .._files import atomic_file, read_text
 from ..console import CommandError
 from ..policies.suite import Case
 from ..scenarios import ScenarioError
@@ -153,8 +153,8 @@ def read_scenario(
     path = folder / source.file
     if (size := path.stat().st_size) > MAX_FILE_BYTES:
         raise ScenarioError(f"{size} bytes; at most {MAX_FILE_BYTES} are read")
-    if path.suffix == ".json":
-        fields = json.loads(path.read_text(encoding="utf-8"))
+    if path.suffix.lower() == ".json":
+        fields = json.loads(read_text(path))
         fields["parameters"] = {**fields.get("parameters", {}), **parameters}
         return ScenarioFile(Storyboard.model_validate(fields))
     options = ReadOptions(parameters, frozenset(source.leave_out), source.ego)
@@ -470,13 +470,13 @@ def _validated(
 def _content(path: Path) -> dict[str, Any]:
     if (size := path.stat().st_size) > MAX_BYTES:
         raise ValueError(f"{size} bytes; at most {MAX_BYTES} are read")
-    text = path.read_text(encoding="utf-8")
+    text = read_text(path)
     # Aliases can expand a small file to a huge one, and no sweep needs them.
-    if path.suffix != ".json" and any(
+    if path.suffix.lower() != ".json" and any(
         isinstance(e, yaml.events.AliasEvent) for e in yaml.parse(text, yaml.SafeLoader)
     ):
         raise ValueError("it has YAML aliases, which are not read")
-    fields = json.loads(text) if path.suffix == ".json" else yaml.safe_load(text)
+    fields = json.loads(text) if path.suffix.lower() == ".json" else yaml.safe_load(text)
     if not isinstance(fields, dict):
         raise ValueError(f"its top level is a {type(fields).__name__}, no mapping")
     return with_kinds(fields)

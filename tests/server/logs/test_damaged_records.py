@@ -108,6 +108,46 @@ def test_twenty_damaged_records_cost_only_themselves(
     compare(base, Read.of(folder), chosen)
 
 
+@pytest.mark.parametrize("copies", [20, pytest.param(200, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("layout", "table"),
+    [("kitti", "training/label_02/0007.txt"), ("street_gaussians", "track/track_info.txt")],
+)
+def test_boxes_of_a_damaged_table_add_up(
+    drive: Any, tmp_path: Path, layout: str, table: str, copies: int
+) -> None:
+    whole, _ = drive(layout)
+    folder = Path(shutil.copytree(whole, tmp_path / whole.name))
+    lines = (folder / table).read_text().splitlines()
+    for seed in range(copies):
+        given = damaged_lines(lines, np.random.default_rng(seed))
+        (folder / table).write_text("\n".join(given), encoding="utf-8")
+        rows = [line.split() for line in (given if layout == "kitti" else given[1:])]
+        held = sum(bool(row) and row[2:3] != ["DontCare"] for row in rows)
+        log = open_log(folder)
+        read = sum(len(track.trajectory.times_us) for track in log.tracks)
+        assert read + len(log.left_out.get("boxes", ())) == held, f"seed {seed}"
+
+
+def damaged_lines(lines: list[str], rng: np.random.Generator) -> list[str]:
+    """Lines of which some are dropped, doubled, cut, blank or have other characters or columns."""
+    found = list(lines)
+    for _ in range(rng.integers(1, 6)):
+        i = int(rng.integers(1, len(found)))
+        line = found[i]
+        at = int(rng.integers(0, max(len(line), 1)))
+        character = "0123456789.-e \t,nanx\u00e9"[rng.integers(0, 20)]
+        found[i : i + 1] = [
+            [],
+            [line, line],
+            [line[:at]],
+            [""],
+            [line[:at] + character + line[at + 1 :]],
+            [f"{line} {line}"],
+        ][rng.integers(0, 6)]
+    return found
+
+
 def compare(base: Read, read: Read, chosen: Iterable[Damage]) -> None:
     lost = {
         name: frozenset().union(*(getattr(d, name) for d in chosen))

@@ -20,6 +20,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from ..._confined import Limits, run_confined
+from ..._files import read_text
 from ...geometry import Float, is_rigid
 from ...scene import GaussianCloud, Scene, Sky
 from ...scene.cloud import SH_DEGREES, rotate_sh
@@ -344,7 +345,7 @@ PNG_MAGIC = b"\x89PNG"
 def read_numbers(path: Path) -> Float:
     """All numbers of a text file, in order. Raises CheckpointError naming it."""
     try:
-        return np.array(path.read_text().split(), dtype=np.float64)
+        return np.array(read_text(path).split(), dtype=np.float64)
     except OSError as error:
         raise CheckpointError(f"{path}: cannot be read: {error.strerror}") from error
     except ValueError as error:

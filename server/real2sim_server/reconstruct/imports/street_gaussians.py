@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..._files import read_text
 from ...geometry import Float, apply_transform, transform_from, yaw_quaternion
 from ...scene import Camera, CameraRig, GaussianCloud, Scene, SceneObject, Sky, Trajectory
 from ...scene.errors import SceneError
@@ -202,7 +203,7 @@ def _visible_rows(folder: Path, cameras: tuple[int, ...], suffix: str) -> list[_
     file = folder / "track" / f"track_info{suffix}.txt"
     seen_file = folder / "track" / f"track_camera_vis{suffix}.json"
     try:
-        lines = file.read_text().splitlines()[1:]
+        lines = read_text(file).splitlines()[1:]
     except OSError as error:
         raise CheckpointError(f"{file}: cannot be read: {error.strerror}") from error
     seen = read_json(seen_file)
