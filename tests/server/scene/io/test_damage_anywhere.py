@@ -39,7 +39,7 @@ def inria_ply() -> bytes:
     names += [f"scale_{i}" for i in range(3)] + [f"rot_{i}" for i in range(4)]
     header = ["ply", "format binary_little_endian 1.0", "element vertex 2"]
     header += [f"property float {name}" for name in names] + ["end_header\n"]
-    return "\n".join(header).encode() + b"\0\0\0\x3f" * (2 * len(names))
+    return "\n".join(header).encode() + b"\0\0\0\xbf" * (2 * len(names))
 
 
 @pytest.mark.parametrize("original", [inria_ply(), compressed_ply()], ids=["inria", "playcanvas"])
