@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from real2sim_proto import ErrorCode
+from real2sim_proto.base import bearer_token
 from real2sim_proto.drive import (
     SHM_FOLDER,
     SHM_HEADER_BYTES,
@@ -286,7 +287,7 @@ class SessionBase(Handle):
         self._memory: SharedFrames | None = None
         self._welcome: Welcome | None = None
         self._result: Result | None = None
-        self._token = plan.token
+        self._token = plan.token if plan.token is None else bearer_token(plan.token)
         self._info: SessionInfo | None = None
 
     def __repr__(self) -> str:

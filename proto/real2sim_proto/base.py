@@ -106,14 +106,20 @@ Quaternion = Annotated[
 ]
 
 
+MAX_TOKEN = 500
+"""Longest token [characters]."""
+
+
 def bearer_token(text: str) -> str:
     """A token for a header, without the surrounding white space that files and shells add.
 
     Raises:
-        ValueError: the token has characters that a header cannot contain. The message does not
-            show the token.
+        ValueError: the token is too long, or has characters that a header cannot contain. The
+            message does not show the token.
     """
     token = text.strip()
+    if len(token) > MAX_TOKEN:
+        raise ValueError(f"the token has {len(token)} characters; at most {MAX_TOKEN} are allowed")
     for place, character in enumerate(token, 1):
         if not " " <= character <= "~":
             raise ValueError(

@@ -12,6 +12,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import ConfigDict, Field, TypeAdapter, WithJsonSchema, model_validator
 
 from .base import (
+    MAX_TOKEN,
     Codec,
     Identifier,
     Microseconds,
@@ -258,7 +259,7 @@ class Score(ServerModel):
 class Resume(Model):
     """Continues a session whose connection was lost."""
 
-    token: str = Field(max_length=500, description="`resume_token` of the welcome")
+    token: str = Field(max_length=MAX_TOKEN, description="`resume_token` of the welcome")
     last_step: int | None = Field(
         default=None, ge=0, description="step of the newest observation received"
     )
@@ -273,7 +274,7 @@ class Hello(Envelope):
     role: Literal["controller", "observer", "agent"] = Field(
         default="controller", description="'agent' drives objects whose driver is 'external'"
     )
-    token: str | None = Field(default=None, max_length=500)
+    token: str | None = Field(default=None, max_length=MAX_TOKEN)
     resume: Resume | None = Field(default=None, description="for a controller")
 
 

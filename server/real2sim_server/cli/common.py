@@ -14,6 +14,7 @@ from ..console import CommandError, console, progress, run_command
 
 if TYPE_CHECKING:
     from ..logs import DrivingLog, LogSelection
+    from ..settings import Settings
 
 
 Function = TypeVar("Function", bound=Callable[..., None])
@@ -75,6 +76,28 @@ RenderBackend = Annotated[str, typer.Option(help="Renderer: auto, cpu, cuda or r
 RenderDevice = Annotated[
     str | None, typer.Option(help="Device: cpu, cuda, cuda:1, ...; default: the renderer's.")
 ]
+
+
+def read_settings(**given: Any) -> Settings:
+    """The settings of the environment, and given ones.
+
+    Raises:
+        CommandError: names the invalid setting, without a secret.
+    """
+    from pydantic import ValidationError
+
+    from ..settings import Settings
+
+    try:
+        return Settings(**given)
+    except ValidationError as error:
+        first = error.errors()[0]
+    name = ".".join(str(part) for part in first["loc"])
+    message = str(first["msg"]).removeprefix("Value error, ")
+    if not name:
+        raise CommandError(message)
+    shown = "" if name == "token" else f" (given: {first['input']!r})"
+    raise CommandError(f"setting {name}: {message}{shown}")
 
 
 def log_selection(frames: str, cameras: str | None, every: int) -> LogSelection:

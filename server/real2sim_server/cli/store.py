@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ..console import CommandError, console, errors, refuse_existing
-from .common import Overwrite, command
+from .common import Overwrite, command, read_settings
 
 if TYPE_CHECKING:
     import sqlalchemy as sa
@@ -70,9 +70,8 @@ def audit(
 
     from ..service.audit import AuditEntry, AuditLog
     from ..service.storage.store import Store
-    from ..settings import Settings
 
-    settings = Settings() if data is None else Settings(data_dir=data)
+    settings = read_settings() if data is None else read_settings(data_dir=data)
 
     async def read() -> list[AuditEntry]:
         store = Store(url or settings.database_url, migration="refuse")
@@ -97,9 +96,8 @@ def _engine(data: Path | None, url: str | None, *, must_exist: bool) -> Iterator
 
     from ..service.storage.connection import connect, file_of, shown_url
     from ..service.storage.database import SCHEMA_TIMEOUT_S, TIMEOUT_S
-    from ..settings import Settings
 
-    settings = Settings() if data is None else Settings(data_dir=data)
+    settings = read_settings() if data is None else read_settings(data_dir=data)
     url = url or settings.database_url
     file = file_of(url)
     if must_exist and file is not None and not file.is_file():
@@ -163,9 +161,8 @@ def restore(
 
 
 def _settings(data: Path | None) -> Settings:
-    from ..settings import Settings
 
-    return Settings() if data is None else Settings(data_dir=data)
+    return read_settings() if data is None else read_settings(data_dir=data)
 
 
 def _database(settings: Settings) -> Path:
@@ -262,9 +259,8 @@ def _limits(token: NamedToken) -> str:
 
 
 def _file(given: Path | None) -> Path:
-    from ..settings import Settings
 
-    found = given or Settings().tokens_file
+    found = given or read_settings().tokens_file
     if found is None:
         raise CommandError("which file? Give --file, or set REAL2SIM_TOKENS_FILE as for the worker")
     return found.absolute()
