@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
+from real2sim_proto.base import invalid_reason
+
 from ..console import CommandError, console, progress, run_command
 
 if TYPE_CHECKING:
@@ -93,11 +95,9 @@ def read_settings(**given: Any) -> Settings:
     except ValidationError as error:
         first = error.errors()[0]
     name = ".".join(str(part) for part in first["loc"])
-    message = str(first["msg"]).removeprefix("Value error, ")
-    if not name:
-        raise CommandError(message)
-    shown = "" if name == "token" else f" (given: {first['input']!r})"
-    raise CommandError(f"setting {name}: {message}{shown}")
+    raise CommandError(
+        f"setting {name}: {invalid_reason(first)}" if name else invalid_reason(first)
+    )
 
 
 def log_selection(frames: str, cameras: str | None, every: int) -> LogSelection:

@@ -313,10 +313,11 @@ def _figures(driven: Driven, events: list[Event]) -> dict[str, Any]:
 
 
 def _print(file: str, figures: dict[str, Any]) -> None:
-    rows = {
-        f"{e['t']:.2f} s": f"{e['what'].split('::')[-1]} {e['change'] or e['type']}"
-        for e in figures["events"]
-    }
+    rows: dict[str, str] = {}
+    for e in figures["events"]:
+        time, what = f"{e['t']:.2f} s", f"{e['what'].split('::')[-1]} {e['change'] or e['type']}"
+        # Several events may happen at one instant.
+        rows[time] = f"{rows[time]}\n{what}" if time in rows else what
     print_figures(f"{Path(file).name}: {figures['seconds']:.1f} s, {figures['reason']}", rows)
 
 

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from real2sim_proto.base import invalid_reason
+
 from .._files import atomic_file
 from ..console import CommandError, console, print_figures, progress, staged_progress, write_json
 from .common import JsonFile, SceneBundle, command
@@ -140,7 +142,8 @@ def simulate(
             )
     figures = _figures(result)
     print_figures(f"{setup.name} on {scene.name}", figures)
-    console.print(f"in {out}: film.mp4, strip.png, curves.png, simulation/", highlight=False)
+    drawn = "film.mp4, strip.png, " if film else ""
+    console.print(f"in {out}: {drawn}curves.png, simulation/", highlight=False)
     write_json(json, figures)
 
 
@@ -170,7 +173,9 @@ def values_of(given: list[str]) -> dict[str, PhysicsValues]:
         except ValidationError as problem:
             first = problem.errors()[0]
             where = ".".join(str(part) for part in first["loc"])
-            raise CommandError(f"--physics {where or 'values'}: {first['msg']}") from problem
+            raise CommandError(
+                f"--physics {where or 'values'}: {invalid_reason(first)}"
+            ) from problem
     return values
 
 
@@ -341,7 +346,7 @@ def _read(path: Path | None) -> Observations:
     except ValidationError as problem:
         first = problem.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
-        raise CommandError(f"{path}: {where}: {first['msg']}") from problem
+        raise CommandError(f"{path}: {where}: {invalid_reason(first)}") from problem
     except (OSError, ValueError, AttributeError, TypeError) as problem:
         raise CommandError(f"{path}: no readable observations: {problem}") from problem
 

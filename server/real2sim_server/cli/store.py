@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from real2sim_proto.base import invalid_reason
+
 from ..console import CommandError, console, errors, refuse_existing
 from .common import Overwrite, command, read_settings
 
@@ -219,7 +221,7 @@ def add(
     except ValidationError as error:
         first = error.errors()[0]
         option = str(first["loc"][0]).replace("_", "-")
-        raise CommandError(f"--{option}: {first['msg']}, not {first['input']!r}") from None
+        raise CommandError(f"--{option}: {invalid_reason(first)}") from None
     path = _file(file)
     token = add_token(path, name, limits, role=role)
     errors.print(

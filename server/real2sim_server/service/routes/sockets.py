@@ -19,7 +19,7 @@ from pydantic import Field, TypeAdapter, ValidationError
 from structlog.contextvars import bound_contextvars
 
 from real2sim_proto import SUPPORTED_SUBPROTOCOLS, ErrorCode
-from real2sim_proto.base import Identifier, Microseconds, Model
+from real2sim_proto.base import Identifier, Microseconds, Model, invalid_reason
 from real2sim_proto.episode import SensorSpec
 from real2sim_proto.operations import Operation
 
@@ -269,7 +269,7 @@ class ViewConnection:
                 first = error.errors()[0]
                 where = ".".join(str(part) for part in first["loc"])
                 await self._send_event(
-                    "error", code="INVALID_REQUEST", detail=f"{where}: {first['msg']}"
+                    "error", code="INVALID_REQUEST", detail=f"{where}: {invalid_reason(first)}"
                 )
                 continue
             self._pending["pick" if request.pick else "picture"] = request
