@@ -34,6 +34,7 @@ from ..engine import QueueFullError
 from ..frames import EncodedFrame
 from ..http.auth import act_for, bearer_token, unauthorized
 from ..http.connections import close_quietly, receive_text
+from ..http.requests import base_url
 from ..http.responses import REQUEST_ID_KEY, ServiceError, problem_response, service_error
 from ..renderer import RenderRequest
 from ..sessions.connection import Connection
@@ -107,8 +108,7 @@ async def _serve_drive(
         raise FatalError(service_error(error, log_unexpected=True), message_id=hello.id) from error
     started, first = time.perf_counter(), _steps(session)
     log.info("drive socket opened", role=hello.role)
-    ws_base = str(socket.base_url).rstrip("/")
-    connection = Connection(socket, session, worker.sessions, ws_base=ws_base)
+    connection = Connection(socket, session, worker.sessions, ws_base=base_url(socket))
     try:
         with ended_when_revoked(connection, account):
             await connection.serve(hello)
