@@ -71,7 +71,9 @@ def simulate(
     max_particles: Annotated[
         int | None,
         typer.Option(
-            min=100, help="Maximum particles of all bodies; fewer are faster and coarser."
+            min=100,
+            max=4_000_000,
+            help="Maximum particles of all bodies; fewer are faster and coarser.",
         ),
     ] = None,
     background: Annotated[
@@ -279,7 +281,7 @@ def calibrate(
         float, typer.Option(min=0.01, max=30, help="Duration of the recorded track to use [s].")
     ] = 1.0,
     max_particles: Annotated[
-        int, typer.Option(min=100, help="Maximum particles of all bodies.")
+        int, typer.Option(min=100, max=4_000_000, help="Maximum particles of all bodies.")
     ] = 20_000,
     steps: Annotated[int, typer.Option(min=1, max=60, help="Maximum steps of the search.")] = 12,
     json: JsonFile = None,
