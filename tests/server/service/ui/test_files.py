@@ -10,6 +10,8 @@ from fastapi.testclient import TestClient
 
 from real2sim_server.service.routes.server import FOLDER, STUDIO
 
+from .hands import behind
+
 OWN = sorted(name for name in STUDIO if not name.startswith("vendor/"))
 """Own files. Vendored files are unmodified."""
 MODULES = [name for name in OWN if name.endswith(".js")]
@@ -31,21 +33,6 @@ def test_the_root_redirects_to_the_page(client):
     for path in ("/", "/ui"):
         answer = client.get(path, follow_redirects=False)
         assert (answer.status_code, answer.headers["location"]) == (307, "ui/")
-
-
-def behind(app, prefix, *, forwarded):
-    """The application as seen through a proxy that removes a prefix from paths."""
-
-    async def proxy(scope, receive, send):
-        path = scope["path"].removeprefix(prefix)
-        assert scope["path"].startswith(prefix + "/"), f"{scope['path']} is outside of {prefix}"
-        headers = [*scope["headers"]]
-        if forwarded:
-            headers.append((b"x-forwarded-prefix", f"{prefix}/".encode()))
-        changes = {"path": path, "raw_path": path.encode(), "headers": headers}
-        await app({**scope, **changes}, receive, send)
-
-    return proxy
 
 
 def pages_from(client, entry):
