@@ -353,7 +353,7 @@ class Request:
     method: str
     path: str
     params: dict[str, str] = field(default_factory=dict)
-    headers: dict[str, str] = field(default_factory=dict)
+    headers: dict[str, str] = field(default_factory=dict, repr=False)
     body: bytes | None = None
     form: dict[str, str] = field(default_factory=dict)
     upload: Path | None = None

@@ -9,7 +9,7 @@ import random
 import stat
 import weakref
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -253,7 +253,7 @@ class SessionPlan:
     scene: str | None = None
     scenario: str | None = None
     session_id: str | None = None
-    token: str | None = None
+    token: str | None = field(default=None, repr=False)
     role: str = "controller"
     codec: str = "auto"
     reconnect: float = 60.0

@@ -11,6 +11,7 @@ from real2sim_proto.errors import HTTP_STATUS, ErrorCode, Problem, title_of
 from real2sim_proto.operations import OPERATION
 from real2sim_proto.plans import PLAN, Control
 from real2sim_proto.scenarios import OperationBatch
+from real2sim_proto.sessions import SessionInfo
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
@@ -153,3 +154,12 @@ def test_a_missing_value_is_named_and_a_secret_is_not_shown():
     reasons = {p["loc"]: invalid_reason(p) for p in caught.value.errors()}
     assert reasons[("protocols",)] == "is missing"
     assert reasons[("token",)] == "must be a valid string"
+
+
+def test_the_repr_of_a_message_does_not_reveal_tokens():
+    resume = drive.Resume(token="hunter2")
+    hello = drive.Hello(id=1, protocols=["p"], token="hunter2", resume=resume)
+    forked = drive.Forked.model_construct(token="hunter2", session_id="w0.1")
+    welcome = drive.Welcome.model_construct(resume_token="hunter2")
+    info = SessionInfo.model_construct(token="hunter2")
+    assert "hunter2" not in repr([hello, resume, forked, welcome, info])
