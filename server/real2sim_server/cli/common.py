@@ -10,8 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
-from real2sim_proto.base import invalid_reason
-
 from ..console import CommandError, console, progress, run_command
 
 if TYPE_CHECKING:
@@ -87,6 +85,8 @@ def read_settings(**given: Any) -> Settings:
         CommandError: names the invalid setting, without a secret.
     """
     from pydantic import ValidationError
+
+    from real2sim_proto.base import invalid_reason
 
     from ..settings import Settings
 

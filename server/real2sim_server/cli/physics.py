@@ -9,8 +9,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from real2sim_proto.base import invalid_reason
-
 from .._files import atomic_file
 from ..console import CommandError, console, print_figures, progress, staged_progress, write_json
 from .common import JsonFile, SceneBundle, command
@@ -153,6 +151,7 @@ def values_of(given: list[str]) -> dict[str, PhysicsValues]:
     """Values of ``--physics`` by object; "*" means all objects."""
     from pydantic import ValidationError
 
+    from real2sim_proto.base import invalid_reason
     from real2sim_proto.operations import PhysicsValues
 
     fields: dict[str, dict[str, str]] = {}
@@ -334,6 +333,7 @@ def _read(path: Path | None) -> Observations:
 
     from pydantic import ValidationError
 
+    from real2sim_proto.base import invalid_reason
     from real2sim_proto.jobs import Observations
 
     if path is None:

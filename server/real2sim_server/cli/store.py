@@ -9,8 +9,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from real2sim_proto.base import invalid_reason
-
 from ..console import CommandError, console, errors, refuse_existing
 from .common import Overwrite, command, read_settings
 
@@ -207,6 +205,8 @@ def add(
 ) -> None:
     """Create a token and print it once; the file keeps its hash."""
     from pydantic import ValidationError
+
+    from real2sim_proto.base import invalid_reason
 
     from ..service.accounts import ROLES, TokenLimits, add_token
 
