@@ -18,7 +18,7 @@ from urllib.parse import quote
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from real2sim_proto import RETRYABLE, CodecError, decode
-from real2sim_proto.base import bearer_token
+from real2sim_proto.base import bearer_token, invalid_reason
 from real2sim_proto.drive import Frame as WireFrame
 from real2sim_proto.drive import PointCloud as WireCloud
 from real2sim_proto.scenarios import HistoryEntry
@@ -327,7 +327,7 @@ def _wire_cloud(value: Any) -> WireCloud:
 
 
 def describe(error: ValidationError, model: type[BaseModel] | None = None) -> str:
-    """Up to four errors in one line: ``sensors/0/width: input should be ...``.
+    """Up to four errors in one line: ``sensors/0/width: must be ...``.
 
     For an unknown member of the model, suggests a valid name.
     """
@@ -335,12 +335,10 @@ def describe(error: ValidationError, model: type[BaseModel] | None = None) -> st
     problems = []
     for problem in error.errors(include_url=False, include_context=False)[:4]:
         place = "/".join(str(part) for part in problem["loc"])
-        given = repr(problem["input"])
-        given = given if len(given) <= 60 else f"{given[:57]}..."
         if members and problem["type"] == "extra_forbidden" and len(problem["loc"]) == 1:
             problems.append(f"there is no {place!r}; {argument_advice(place, members)}")
         else:
-            problems.append(f"{place}: {problem['msg']}, not {given}")
+            problems.append(f"{place}: {invalid_reason(problem)}")
     more = error.error_count() - len(problems)
     return "; ".join(problems) + (f"; and {more} more" if more > 0 else "")
 
@@ -355,7 +353,7 @@ class Request:
     method: str
     path: str
     params: dict[str, str] = field(default_factory=dict)
-    headers: dict[str, str] = field(default_factory=dict)
+    headers: dict[str, str] = field(default_factory=dict, repr=False)
     body: bytes | None = None
     form: dict[str, str] = field(default_factory=dict)
     upload: Path | None = None

@@ -39,7 +39,8 @@ class Target:
     """Address of the worker, and timeouts.
 
     Attributes:
-        url: ``http://host:port`` or ``https://...``, with an optional path prefix.
+        url: ``http://host:port`` or ``https://...``, with an optional path prefix; white space
+            around it and slashes at its end are removed.
         token: sent as bearer token; never displayed.
         timeout: maximum seconds to wait for a reply.
         long_timeout: seconds for calls that may load a scene, compile kernels or run many steps.
@@ -57,18 +58,13 @@ class Target:
     shared_memory: bool | None = None
 
     def __post_init__(self) -> None:
-        parts = urlsplit(self.url)
-        if parts.scheme not in {"http", "https"} or not parts.hostname:
-            raise ValueError(f"url {self.url!r} is not an address like {DEFAULT_URL!r}")
-        if parts.username or parts.password:
-            raise ValueError("the url holds credentials; give a token as token=... instead")
+        object.__setattr__(self, "url", _checked_url(self.url))
         if self.name is not None and not re.fullmatch(r"[ -~]{1,80}", self.name):
             raise ValueError(f"name {self.name!r} is not 1 to 80 printable ASCII characters")
         if self.timeout <= 0:
             raise ValueError(f"timeout is {self.timeout!r}; give seconds above 0")
         if self.token is not None:
             object.__setattr__(self, "token", bearer_token(self.token) or None)
-        object.__setattr__(self, "url", self.url.rstrip("/"))
         object.__setattr__(self, "long_timeout", max(self.long_timeout, self.timeout))
 
     def __str__(self) -> str:
@@ -108,6 +104,31 @@ class Target:
         return self.codec(codec)
 
 
+def _checked_url(text: str) -> str:
+    """An address without surrounding white space. Messages never show what may be a secret."""
+    url = text.strip().rstrip("/")
+    for place, character in enumerate(url, 1):
+        if character.isspace() or not character.isprintable():
+            raise ValueError(
+                f"character {place} of the url is U+{ord(character):04X}; an address has no white "
+                "space and no control characters"
+            )
+    if "@" in url:
+        raise ValueError("the url holds credentials; give a token as token=... instead")
+    if "?" in url or "#" in url:
+        raise ValueError(
+            "the url has a part after '?' or '#'; give only the address, and a token as token=..."
+        )
+    try:
+        parts = urlsplit(url)
+        found = parts.scheme in {"http", "https"} and parts.hostname and parts.port != 0
+    except ValueError:
+        found = False
+    if not found:
+        raise ValueError(f"url {url!r} is not an address like {DEFAULT_URL!r}")
+    return url
+
+
 def resolve_target(
     url: str | None,
     token: str | None,
@@ -120,20 +141,32 @@ def resolve_target(
     """Resolve a target from arguments; for None, from the environment, then the defaults.
 
     Raises:
-        ValueError: invalid address; the message says whether it comes from the environment.
+        ValueError: invalid address or token; the message says whether it comes from the
+            environment.
     """
-    found = url or os.environ.get(URL_VARIABLE) or DEFAULT_URL
-    if token is None:
-        token = os.environ.get(TOKEN_VARIABLE)
-    policy = RetryPolicy(retries)
+    if not url and (found := os.environ.get(URL_VARIABLE)):
+        with _from_variable(URL_VARIABLE):
+            url = _checked_url(found)
+    if token is None and (found := os.environ.get(TOKEN_VARIABLE)):
+        with _from_variable(TOKEN_VARIABLE):
+            token = bearer_token(found)
+    return Target(
+        url or DEFAULT_URL,
+        token or None,
+        timeout,
+        name=name,
+        policy=RetryPolicy(retries),
+        shared_memory=shared_memory,
+    )
+
+
+@contextlib.contextmanager
+def _from_variable(name: str) -> Iterator[None]:
+    """Add the name of an environment variable to the error for its value."""
     try:
-        return Target(
-            found, token or None, timeout, name=name, policy=policy, shared_memory=shared_memory
-        )
+        yield
     except ValueError as error:
-        if url or found == DEFAULT_URL:
-            raise
-        raise ValueError(f"{error} (from {URL_VARIABLE})") from None
+        raise ValueError(f"{error} (from {name})") from None
 
 
 UNREACHABLE_HINT = "start a worker with `real2sim serve`, or check the address"

@@ -9,7 +9,7 @@ import random
 import stat
 import weakref
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from real2sim_proto import ErrorCode
+from real2sim_proto.base import bearer_token
 from real2sim_proto.drive import (
     SHM_FOLDER,
     SHM_HEADER_BYTES,
@@ -252,7 +253,7 @@ class SessionPlan:
     scene: str | None = None
     scenario: str | None = None
     session_id: str | None = None
-    token: str | None = None
+    token: str | None = field(default=None, repr=False)
     role: str = "controller"
     codec: str = "auto"
     reconnect: float = 60.0
@@ -286,7 +287,7 @@ class SessionBase(Handle):
         self._memory: SharedFrames | None = None
         self._welcome: Welcome | None = None
         self._result: Result | None = None
-        self._token = plan.token
+        self._token = plan.token if plan.token is None else bearer_token(plan.token)
         self._info: SessionInfo | None = None
 
     def __repr__(self) -> str:

@@ -76,7 +76,8 @@ class DriveEnv(gymnasium.Env[Obs, NDArray[np.float32]]):
     [m/s], length, width [m]. A LiDAR under its name is [P, 4] float32: x, y, z [m] and intensity;
     more than P returns are subsampled evenly. A radar is [256, 5] float32: x, y, z, radial velocity
     [m/s] and RCS [dBsm], nearest first. Unused rows are zero. A slower sensor repeats its last
-    image or cloud until the next one is due.
+    image or cloud of the episode until the next one is due; before the first one it is all zero.
+    The arrays are yours: later steps do not change them.
 
     Reward: metres of progress along the route, minus 10 for a contact that is the ego's fault,
     minus 0.1 per step off the road. ``info`` has ``metrics``, ``events`` and the episode's randomly
@@ -164,6 +165,7 @@ class DriveEnv(gymnasium.Env[Obs, NDArray[np.float32]]):
         super().reset(seed=seed)
         drawn = seed if seed is not None else int(self.np_random.integers(2**31))
         self._last = self._begin(drawn, options)
+        self._images, self._clouds = {}, {}
         return self._seen(self._last), self._info(self._last)
 
     def step(self, action: NDArray[np.float32]) -> tuple[Obs, float, bool, bool, dict[str, Any]]:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import difflib
+import math
+import re
 from collections.abc import Iterable, Mapping
 from typing import (
     TYPE_CHECKING,
@@ -106,14 +108,54 @@ Quaternion = Annotated[
 ]
 
 
+# Reasons for invalid values.
+
+MAX_GIVEN = 60
+"""Longest value that a reason shows [characters]."""
+SECRETS = ("token", "secret")
+"""Members whose values are never shown."""
+
+_SHOULD = re.compile(r"^(?:[A-Z][a-z]+|URL|JSON) should ")
+
+
+def invalid_reason(problem: Mapping[str, Any]) -> str:
+    """Why a value is invalid, without its place: ``must be a finite number, got NaN``.
+
+    Args:
+        problem: an entry of pydantic's ``ValidationError.errors()``.
+    """
+    kind, place = problem["type"], problem["loc"]
+    message = str(problem["msg"]).removeprefix("Value error, ")
+    if kind == "missing":
+        return "is missing"
+    if kind == "extra_forbidden":
+        return "is not a known member"
+    said = _SHOULD.sub("must ", message)
+    told = said == message or ", not " in said or "input" not in problem
+    if told or (place and place[-1] in SECRETS):
+        return said
+    value = problem["input"]
+    if isinstance(value, float) and not math.isfinite(value):
+        given = "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
+    else:
+        given = repr(value)
+    return f"{said}, got {given}" if len(given) <= MAX_GIVEN else said
+
+
+MAX_TOKEN = 500
+"""Longest token [characters]."""
+
+
 def bearer_token(text: str) -> str:
     """A token for a header, without the surrounding white space that files and shells add.
 
     Raises:
-        ValueError: the token has characters that a header cannot contain. The message does not
-            show the token.
+        ValueError: the token is too long, or has characters that a header cannot contain. The
+            message does not show the token.
     """
     token = text.strip()
+    if len(token) > MAX_TOKEN:
+        raise ValueError(f"the token has {len(token)} characters; at most {MAX_TOKEN} are allowed")
     for place, character in enumerate(token, 1):
         if not " " <= character <= "~":
             raise ValueError(

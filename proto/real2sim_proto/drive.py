@@ -12,6 +12,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import ConfigDict, Field, TypeAdapter, WithJsonSchema, model_validator
 
 from .base import (
+    MAX_TOKEN,
     Codec,
     Identifier,
     Microseconds,
@@ -258,7 +259,9 @@ class Score(ServerModel):
 class Resume(Model):
     """Continues a session whose connection was lost."""
 
-    token: str = Field(max_length=500, description="`resume_token` of the welcome")
+    token: str = Field(
+        max_length=MAX_TOKEN, repr=False, description="`resume_token` of the welcome"
+    )
     last_step: int | None = Field(
         default=None, ge=0, description="step of the newest observation received"
     )
@@ -273,7 +276,7 @@ class Hello(Envelope):
     role: Literal["controller", "observer", "agent"] = Field(
         default="controller", description="'agent' drives objects whose driver is 'external'"
     )
-    token: str | None = Field(default=None, max_length=500)
+    token: str | None = Field(default=None, max_length=MAX_TOKEN, repr=False)
     resume: Resume | None = Field(default=None, description="for a controller")
 
 
@@ -470,7 +473,7 @@ class Welcome(ServerEnvelope):
     step: int | None = Field(description="step of the running episode; None before reset")
     revision: int = Field(default=0, description="revision of the session's edits")
     resume_token: str | None = Field(
-        default=None, description="for a controller: resumes after a lost connection"
+        repr=False, default=None, description="for a controller: resumes after a lost connection"
     )
     shared_memory: SharedMemory | None = Field(
         default=None,
@@ -573,7 +576,7 @@ class Forked(ServerEnvelope):
 
     type: Literal["forked"] = "forked"
     session_id: str
-    token: str
+    token: str = Field(repr=False)
     ws_url: str
     step: int
 

@@ -39,7 +39,9 @@ class SessionInfo(Reply):
     scene: str
     scenario_id: str | None = None
     ws_url: str = Field(description="address of the drive socket")
-    token: str = Field(description="authorises the drive socket and this session's REST calls")
+    token: str = Field(
+        repr=False, description="authorises the drive socket and this session's REST calls"
+    )
     owner: str = Field(default="default", description="name of the token that created it")
     created_at: str
     step: int | None = None

@@ -16,6 +16,9 @@ from real2sim_proto.base import bearer_token
 GIB = 1024**3
 MIB = 1024**2
 
+MIN_TOKEN = 8
+"""Shortest token [characters]."""
+
 
 def _default_data_dir() -> Path:
     state = os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share"
@@ -105,7 +108,7 @@ class Settings(BaseSettings):
     port: int = Field(default=8600, ge=0, le=65535)
     token_file: Path | None = None
     tokens_file: Path | None = None
-    token: SecretStr | None = Field(default=None, min_length=8)
+    token: SecretStr | None = None
     worker_id: str = Field(default="w0", pattern=r"^w[0-9]{1,6}$")
     data_dir: Path = Field(default_factory=_default_data_dir)
     scenes_dir: Path | None = None
@@ -171,10 +174,33 @@ class Settings(BaseSettings):
             raise ValueError("token and token_file are both given; one of them is enough")
         return given | {"token": read_token(Path(file))}
 
+    @model_validator(mode="before")
+    @classmethod
+    def _without_white_space(cls, given: dict[str, Any]) -> dict[str, Any]:
+        # The last validator runs first. Lines of files may end with a carriage return.
+        found = {k: v.strip() if isinstance(v, str) else v for k, v in given.items()}
+        for name, value in found.items():
+            # The token has rules of its own.
+            if name != "token" and isinstance(value, str) and not value.isprintable():
+                place = next(k for k, c in enumerate(value) if not c.isprintable())
+                raise ValueError(
+                    f"setting {name}: character {place + 1} is U+{ord(value[place]):04X}; control "
+                    "characters are not allowed"
+                )
+        return found
+
     @field_validator("token", mode="before")
     @classmethod
     def _token_fits_a_header(cls, given: Any) -> Any:
-        return bearer_token(given) if isinstance(given, str) else given
+        if not isinstance(given, str):
+            return given
+        token = bearer_token(given)
+        if len(token) < MIN_TOKEN:
+            raise ValueError(
+                f"it is shorter than {MIN_TOKEN} characters; take the output of `openssl rand -hex "
+                "16`, or unset it"
+            )
+        return token
 
     @property
     def needs_token(self) -> bool:
@@ -217,13 +243,13 @@ LIKENESS = 0.8
 
 
 def read_token(file: Path) -> str:
-    """The token in a file, without the newline at its end.
+    """The token in a file, without a byte-order mark and the newline at its end.
 
     Raises:
         ValueError: the file cannot be read, or does not contain a token.
     """
     try:
-        text = file.read_text("utf-8")
+        text = file.read_text("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "it is not text"
         raise ValueError(f"the token cannot be read from {str(file)!r}: {reason}") from error

@@ -76,6 +76,57 @@ def test_an_invalid_url_from_the_environment_names_the_variable(
         real2sim.connect()
 
 
+@pytest.mark.parametrize("text", ["http://worker:1/ ", "http://worker:1\r", " http://worker:1//\n"])
+def test_white_space_and_slashes_around_the_url_are_removed(
+    monkeypatch: pytest.MonkeyPatch, text: str
+) -> None:
+    assert str(request_of(url=text).url) == "http://worker:1/v1/scenes"
+    monkeypatch.setenv("REAL2SIM_URL", text)
+    assert str(request_of().url) == "http://worker:1/v1/scenes"
+
+
+@pytest.mark.parametrize(
+    ("url", "said"),
+    [
+        ("http://anna:hunter2@worker", "holds credentials"),
+        ("ftp://anna:hunter2@worker", "holds credentials"),
+        ("anna:hunter2@worker:80", "holds credentials"),
+        ("http://worker/?token=hunter2", "part after"),
+        ("http://worker/#hunter2", "part after"),
+        ("http://wor\nker/hunter2", "character 11 of the url is U\\+000A"),
+        ("http://wor ker", "character 11 of the url is U\\+0020"),
+        ("http://worker:99999", "is not an address"),
+        ("http://worker:port", "is not an address"),
+        ("http://[::1", "is not an address"),
+        ("localhost:8600", "is not an address"),
+    ],
+)
+def test_a_url_that_is_no_address_is_refused_without_its_secrets(url: str, said: str) -> None:
+    with pytest.raises(ValueError, match=said) as caught:
+        real2sim.connect(url)
+    assert "hunter2" not in str(caught.value)
+
+
+def test_a_token_loses_the_carriage_return_of_a_file(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("REAL2SIM_TOKEN", "secret\r")
+    assert request_of().headers["authorization"] == "Bearer secret"
+
+
+@pytest.mark.parametrize("token", ["hun\nter2", "hun\rter2", "hünter2", "hunter2" * 100])
+def test_an_invalid_token_is_refused_without_revealing_it(
+    monkeypatch: pytest.MonkeyPatch, token: str
+) -> None:
+    with pytest.raises(ValueError, match="the token") as given:
+        real2sim.connect(token=token)
+    monkeypatch.setenv("REAL2SIM_TOKEN", token)
+    with pytest.raises(ValueError, match=r"the token .*from REAL2SIM_TOKEN") as found:
+        real2sim.connect()
+    with pytest.raises(ValueError, match="the token") as joined:
+        real2sim.connect(token="").join("w0-1", token=token)
+    for caught in (given, found, joined):
+        assert "ter2" not in str(caught.value)
+
+
 def test_the_async_client_reads_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("REAL2SIM_URL", "http://worker:9000")
     assert repr(real2sim.connect_async()) == "AsyncClient('http://worker:9000', token=None)"

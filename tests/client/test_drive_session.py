@@ -174,7 +174,7 @@ def test_a_restarting_worker_is_reported_with_its_reason(worker: FakeWorker) -> 
         ("garbage", "cannot be read"),
         ("text", "sent text"),
         ("another type", "edited with id 3 arrived, but observation 1"),
-        ("missing fields", "t_us: Field required"),
+        ("missing fields", "t_us: is missing"),
     ],
 )
 def test_malformed_replies_are_explained(worker: FakeWorker, mischief: str, sentence: str) -> None:

@@ -5,12 +5,13 @@ import pytest
 from pydantic import ValidationError
 
 from real2sim_proto import conventions, drive, operations
-from real2sim_proto.base import Pose
+from real2sim_proto.base import Pose, invalid_reason
 from real2sim_proto.drive import CLIENT_MESSAGE
 from real2sim_proto.errors import HTTP_STATUS, ErrorCode, Problem, title_of
 from real2sim_proto.operations import OPERATION
-from real2sim_proto.plans import PLAN
+from real2sim_proto.plans import PLAN, Control
 from real2sim_proto.scenarios import OperationBatch
+from real2sim_proto.sessions import SessionInfo
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
@@ -126,3 +127,39 @@ def test_unknown_members_are_ignored_from_workers_and_refused_from_clients():
     assert drive.SERVER_MESSAGE.validate_python(answer).revision == 2
     with pytest.raises(ValidationError, match="extra"):
         CLIENT_MESSAGE.validate_python({"v": 1, "type": "bye", "id": 1, "extra": "good"})
+
+
+@pytest.mark.parametrize(
+    ("changes", "reasons"),
+    [
+        ({"steering": float("nan")}, ["must be a finite number, got NaN"]),
+        ({"steering": -float("inf")}, ["must be a finite number, got -Infinity"]),
+        ({"steering": 2.0}, ["must be less than or equal to 1.6, got 2.0"]),
+        ({"steering": "left"}, ["must be a valid number, unable to parse string as a number"]),
+        ({"gear": "R"}, ["must be 'drive' or 'reverse', got 'R'"]),
+        ({"gear": "R" * 100}, ["must be 'drive' or 'reverse'"]),
+        ({"brake": 1}, ["is not a known member"]),
+    ],
+)
+def test_the_reason_for_an_invalid_value_is_a_sentence(changes, reasons):
+    with pytest.raises(ValidationError) as caught:
+        Control.model_validate({"acceleration": 0.0, "steering": 0.0} | changes)
+    found = [invalid_reason(problem) for problem in caught.value.errors()]
+    assert [said[: len(reason)] for said, reason in zip(found, reasons, strict=True)] == reasons
+
+
+def test_a_missing_value_is_named_and_a_secret_is_not_shown():
+    with pytest.raises(ValidationError) as caught:
+        drive.Hello.model_validate({"token": 12345678, "id": 1})
+    reasons = {p["loc"]: invalid_reason(p) for p in caught.value.errors()}
+    assert reasons[("protocols",)] == "is missing"
+    assert reasons[("token",)] == "must be a valid string"
+
+
+def test_the_repr_of_a_message_does_not_reveal_tokens():
+    resume = drive.Resume(token="hunter2")
+    hello = drive.Hello(id=1, protocols=["p"], token="hunter2", resume=resume)
+    forked = drive.Forked.model_construct(token="hunter2", session_id="w0.1")
+    welcome = drive.Welcome.model_construct(resume_token="hunter2")
+    info = SessionInfo.model_construct(token="hunter2")
+    assert "hunter2" not in repr([hello, resume, forked, welcome, info])

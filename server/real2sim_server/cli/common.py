@@ -14,6 +14,7 @@ from ..console import CommandError, console, progress, run_command
 
 if TYPE_CHECKING:
     from ..logs import DrivingLog, LogSelection
+    from ..settings import Settings
 
 
 Function = TypeVar("Function", bound=Callable[..., None])
@@ -94,6 +95,28 @@ def changed_bundle(scene: Path, out: Path | None) -> Path:
             f"{scene} is not a bundle that can be changed; name a new one with --out"
         )
     return scene if out is None else out
+
+
+def read_settings(**given: Any) -> Settings:
+    """The settings of the environment, and given ones.
+
+    Raises:
+        CommandError: names the invalid setting, without a secret.
+    """
+    from pydantic import ValidationError
+
+    from real2sim_proto.base import invalid_reason
+
+    from ..settings import Settings
+
+    try:
+        return Settings(**given)
+    except ValidationError as error:
+        first = error.errors()[0]
+    name = ".".join(str(part) for part in first["loc"])
+    raise CommandError(
+        f"setting {name}: {invalid_reason(first)}" if name else invalid_reason(first)
+    )
 
 
 def log_selection(frames: str, cameras: str | None, every: int) -> LogSelection:

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from ..scenarios.openscenario import ReadOptions
     from ..scene import Scene
     from ..sweeps.episode import Driven
+    from ..world import World
     from ..world.agents import Event
     from ..world.recording import Recording
     from ..world.replay import Replayer
@@ -134,12 +135,13 @@ def run(
             board = fitted_to_scene(board, loaded)
         report("scene", 1, 1)
         board = board.model_copy(update={"drives_ego": planner == SCRIPTED})
-        driven, events = _drive(loaded, board, planner, seed=seed, seconds=seconds)
+        driven, events = _drive(loaded, board, planner, report, seed=seed, seconds=seconds)
         if save is not None or video is not None:
             recording = recording_of(loaded, driven)
             if save is not None:
                 save_recording(recording, save)
             if video is not None:
+                report("video", 0, 1)
                 _film(recording, loaded, video, camera)
     figures = _figures(driven, events)
     _print(file, figures)
@@ -244,7 +246,13 @@ def _flat_scene(board: Storyboard, road_file: Path | None, made: Path) -> Scene:
 
 
 def _drive(
-    scene: Scene, board: Storyboard, planner: str, *, seed: int, seconds: float
+    scene: Scene,
+    board: Storyboard,
+    planner: str,
+    report: Callable[..., None],
+    *,
+    seed: int,
+    seconds: float,
 ) -> tuple[Driven, list[Event]]:
     """Drive the episode and return it with its events."""
     from real2sim.planners import load_planner
@@ -255,12 +263,17 @@ def _drive(
     driver: Any = _Scripted() if planner == SCRIPTED else load_planner(planner)
     options = run_options(board, seed=seed, seconds=seconds)
     events: list[Event] = []
+
+    def follow(world: World) -> None:
+        events.extend(world.observe().events)
+        report("drive", world.steps, options["horizon"])
+
     driven = drive_episode(
         scene,
         Drive(planner, options),
         driver,
         keep_entries=True,
-        on_world=lambda world: events.extend(world.observe().events),
+        on_world=follow,
     )
     if driven.error is not None or driven.world is None:
         raise CommandError(driven.error or "the episode could not begin")
@@ -314,10 +327,11 @@ def _figures(driven: Driven, events: list[Event]) -> dict[str, Any]:
 
 
 def _print(file: str, figures: dict[str, Any]) -> None:
-    rows = {
-        f"{e['t']:.2f} s": f"{e['what'].split('::')[-1]} {e['change'] or e['type']}"
-        for e in figures["events"]
-    }
+    rows: dict[str, str] = {}
+    for e in figures["events"]:
+        time, what = f"{e['t']:.2f} s", f"{e['what'].split('::')[-1]} {e['change'] or e['type']}"
+        # Several events may happen at one instant.
+        rows[time] = f"{rows[time]}\n{what}" if time in rows else what
     print_figures(f"{Path(file).name}: {figures['seconds']:.1f} s, {figures['reason']}", rows)
 
 

@@ -69,7 +69,9 @@ def simulate(
     max_particles: Annotated[
         int | None,
         typer.Option(
-            min=100, help="Maximum particles of all bodies; fewer are faster and coarser."
+            min=100,
+            max=4_000_000,
+            help="Maximum particles of all bodies; fewer are faster and coarser.",
         ),
     ] = None,
     background: Annotated[
@@ -140,7 +142,8 @@ def simulate(
             )
     figures = _figures(result)
     print_figures(f"{setup.name} on {scene.name}", figures)
-    console.print(f"in {out}: film.mp4, strip.png, curves.png, simulation/", highlight=False)
+    drawn = "film.mp4, strip.png, " if film else ""
+    console.print(f"in {out}: {drawn}curves.png, simulation/", highlight=False)
     write_json(json, figures)
 
 
@@ -148,6 +151,7 @@ def values_of(given: list[str]) -> dict[str, PhysicsValues]:
     """Values of ``--physics`` by object; "*" means all objects."""
     from pydantic import ValidationError
 
+    from real2sim_proto.base import invalid_reason
     from real2sim_proto.operations import PhysicsValues
 
     fields: dict[str, dict[str, str]] = {}
@@ -170,7 +174,9 @@ def values_of(given: list[str]) -> dict[str, PhysicsValues]:
         except ValidationError as problem:
             first = problem.errors()[0]
             where = ".".join(str(part) for part in first["loc"])
-            raise CommandError(f"--physics {where or 'values'}: {first['msg']}") from problem
+            raise CommandError(
+                f"--physics {where or 'values'}: {invalid_reason(first)}"
+            ) from problem
     return values
 
 
@@ -274,7 +280,7 @@ def calibrate(
         float, typer.Option(min=0.01, max=30, help="Duration of the recorded track to use [s].")
     ] = 1.0,
     max_particles: Annotated[
-        int, typer.Option(min=100, help="Maximum particles of all bodies.")
+        int, typer.Option(min=100, max=4_000_000, help="Maximum particles of all bodies.")
     ] = 20_000,
     steps: Annotated[int, typer.Option(min=1, max=60, help="Maximum steps of the search.")] = 12,
     json: JsonFile = None,
@@ -327,6 +333,7 @@ def _read(path: Path | None) -> Observations:
 
     from pydantic import ValidationError
 
+    from real2sim_proto.base import invalid_reason
     from real2sim_proto.jobs import Observations
 
     if path is None:
@@ -341,7 +348,7 @@ def _read(path: Path | None) -> Observations:
     except ValidationError as problem:
         first = problem.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
-        raise CommandError(f"{path}: {where}: {first['msg']}") from problem
+        raise CommandError(f"{path}: {where}: {invalid_reason(first)}") from problem
     except (OSError, ValueError, AttributeError, TypeError) as problem:
         raise CommandError(f"{path}: no readable observations: {problem}") from problem
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,7 +10,7 @@ import typer
 from rich.markup import escape
 
 from ..console import LISTENERS, CommandError, errors
-from .common import command
+from .common import command, read_settings
 
 # --- serve ----------------------------------------------------------------------------------------
 
@@ -42,10 +41,8 @@ def serve(
     ] = None,
 ) -> None:
     """Start a worker. Other settings come from REAL2SIM_* variables."""
-    from pydantic import ValidationError
-
     from ..service.preflight import begin_compiling, check_start
-    from ..settings import Settings, read_token
+    from ..settings import read_token
 
     _check_variables()
     if token is not None:
@@ -65,10 +62,7 @@ def serve(
         "backend": backend,
     }
     given = {name: value for name, value in options.items() if value is not None}
-    try:
-        settings = Settings(**given)
-    except ValidationError as error:
-        raise CommandError(_said(error.errors()[0])) from None
+    settings = read_settings(**given)
     # Fail before the worker's libraries load, which takes seconds.
     check_start(settings)
     begin_compiling()
@@ -94,16 +88,6 @@ def _check_variables() -> None:
                 f"{name} is not a setting; do you mean {nearest}? Correct it, or unset {name}"
             )
         _warn(f"{name} is not a setting and is ignored")
-
-
-def _said(error: Mapping[str, Any]) -> str:
-    """Messages of a settings error, without secrets."""
-    name = ".".join(str(part) for part in error["loc"])
-    message = str(error["msg"]).removeprefix("Value error, ")
-    if not name:
-        return message
-    given = "" if name == "token" else f" (given: {error['input']!r})"
-    return f"setting {name}: {message}{given}"
 
 
 def _warn(message: str) -> None:

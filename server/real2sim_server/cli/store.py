@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ..console import CommandError, console, errors, refuse_existing
-from .common import Overwrite, command
+from .common import Overwrite, command, read_settings
 
 if TYPE_CHECKING:
     import sqlalchemy as sa
@@ -70,9 +70,8 @@ def audit(
 
     from ..service.audit import AuditEntry, AuditLog
     from ..service.storage.store import Store
-    from ..settings import Settings
 
-    settings = Settings() if data is None else Settings(data_dir=data)
+    settings = read_settings() if data is None else read_settings(data_dir=data)
 
     async def read() -> list[AuditEntry]:
         store = Store(url or settings.database_url, migration="refuse")
@@ -97,9 +96,8 @@ def _engine(data: Path | None, url: str | None, *, must_exist: bool) -> Iterator
 
     from ..service.storage.connection import connect, file_of, shown_url
     from ..service.storage.database import SCHEMA_TIMEOUT_S, TIMEOUT_S
-    from ..settings import Settings
 
-    settings = Settings() if data is None else Settings(data_dir=data)
+    settings = read_settings() if data is None else read_settings(data_dir=data)
     url = url or settings.database_url
     file = file_of(url)
     if must_exist and file is not None and not file.is_file():
@@ -163,9 +161,8 @@ def restore(
 
 
 def _settings(data: Path | None) -> Settings:
-    from ..settings import Settings
 
-    return Settings() if data is None else Settings(data_dir=data)
+    return read_settings() if data is None else read_settings(data_dir=data)
 
 
 def _database(settings: Settings) -> Path:
@@ -209,6 +206,8 @@ def add(
     """Create a token and print it once; the file keeps its hash."""
     from pydantic import ValidationError
 
+    from real2sim_proto.base import invalid_reason
+
     from ..service.accounts import ROLES, TokenLimits, add_token
 
     if role not in ROLES:
@@ -222,7 +221,7 @@ def add(
     except ValidationError as error:
         first = error.errors()[0]
         option = str(first["loc"][0]).replace("_", "-")
-        raise CommandError(f"--{option}: {first['msg']}, not {first['input']!r}") from None
+        raise CommandError(f"--{option}: {invalid_reason(first)}") from None
     path = _file(file)
     token = add_token(path, name, limits, role=role)
     errors.print(
@@ -262,9 +261,8 @@ def _limits(token: NamedToken) -> str:
 
 
 def _file(given: Path | None) -> Path:
-    from ..settings import Settings
 
-    found = given or Settings().tokens_file
+    found = given or read_settings().tokens_file
     if found is None:
         raise CommandError("which file? Give --file, or set REAL2SIM_TOKENS_FILE as for the worker")
     return found.absolute()

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from real2sim_proto.base import invalid_reason
 from real2sim_proto.episode import Randomization, ResetSpec
 from real2sim_proto.operations import Operation
 
@@ -174,5 +175,5 @@ def _sentence(error: Exception) -> str:
     if isinstance(error, ValidationError):
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
-        return f"{where}: {first['msg']}" if where else str(first["msg"])
+        return f"{where}: {invalid_reason(first)}" if where else invalid_reason(first)
     return f"no {error}" if isinstance(error, KeyError) else str(error)

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import TypeAdapter, ValidationError
 
+from real2sim_proto.base import invalid_reason
 from real2sim_proto.sensors import (
     MAX_RAYS,
     GridBeams,
@@ -329,7 +330,8 @@ def lidar_from_values(values: Any) -> Lidar:
         model = TypeAdapter(LidarModel).validate_python(values)
     except ValidationError as error:
         reasons = [
-            f"{'.'.join(map(str, issue['loc']))}: {issue['msg']}" for issue in error.errors()[:4]
+            f"{'.'.join(map(str, issue['loc']))}: {invalid_reason(issue)}"
+            for issue in error.errors()[:4]
         ]
         raise LidarError("; ".join(reasons)) from error
     return lidar_of(model)

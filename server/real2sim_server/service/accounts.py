@@ -21,6 +21,8 @@ from typing import Annotated, Any, Literal, NamedTuple
 import structlog
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from real2sim_proto.base import invalid_reason
+
 from .._files import atomic_file
 from . import clock
 
@@ -180,7 +182,7 @@ def read_token_file(path: Path) -> TokenFile:
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         where = "/".join(str(part) for part in first["loc"])
-        message = str(first["msg"]).removeprefix("Value error, ")
+        message = invalid_reason(first)
         raise TokenFileError(
             f"{str(path)!r} is not a token file: {f'{where}: ' * bool(where)}{message}; "
             "`real2sim token` writes such files"
@@ -209,7 +211,7 @@ def add_token(path: Path, name: str, limits: TokenLimits, *, role: Role = "admin
         )
         changed = TokenFile(tokens=(*present.tokens, added))
     except ValidationError as error:
-        message = str(error.errors()[0]["msg"]).removeprefix("Value error, ")
+        message = invalid_reason(error.errors()[0])
         raise TokenFileError(f"{name!r} cannot be a token's name: {message}") from error
     _write(path, changed)
     return token

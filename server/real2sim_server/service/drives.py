@@ -10,7 +10,7 @@ import sys
 from collections import OrderedDict, defaultdict
 from collections.abc import AsyncIterator, Mapping, Sequence
 from contextlib import asynccontextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Self
 
 import numpy as np
@@ -289,7 +289,7 @@ class Seat:
 
     session: Session
     url: str
-    token: str
+    token: str = field(repr=False)
 
 
 class Drives:

@@ -12,7 +12,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import FrameType
 from typing import Any
 
@@ -121,7 +121,7 @@ class RunningWorker:
     """
 
     url: str
-    token: str | None
+    token: str | None = field(repr=False)
     worker: Worker
 
 

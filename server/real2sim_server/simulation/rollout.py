@@ -12,6 +12,7 @@ import numpy as np
 from ..geometry import Float, apply_transform, matrix_to_quaternion
 from ..physics.colliders import Box, Collider
 from ..physics.errors import PhysicsError
+from ..physics.solver import VISCOUS_STEP
 from ..scene import Scene
 from .background import BACKGROUND, Cleared, background_colliders, described
 from .body import BodyMode, DeformableBody
@@ -196,6 +197,10 @@ def _triple(vector: Float) -> tuple[float, float, float]:
 
 
 PARTICLES_MIN = 100
+MAX_FRAMES = 100_000
+MAX_SUBSTEPS, CONTACT_TIME = 200_000, 10.0
+"""Largest number of substeps of a body that deforms all the time, at most this long [s]; in longer
+rollouts, bodies are rigid or asleep most of the time and need none."""
 BESIDE, FURTHEST = 10.0, 80.0
 """Margin beyond the reach of the fastest object within which the background counts, and maximum
 distance [m]."""
@@ -248,6 +253,13 @@ class SimulateOptions:
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
                 raise PhysicsError(f"{name} must be positive, not {value!r}")
+        frames = self.duration * self.frame_rate if self.times_s is None else len(self.times_s)
+        if frames > MAX_FRAMES:
+            raise PhysicsError(
+                f"{self.duration:g} s at {self.frame_rate:g} frames per second are {frames:,.0f} "
+                f"frames; at most {MAX_FRAMES:,} are recorded: simulate a shorter time, or record "
+                "fewer frames per second"
+            )
         if not 0 <= self.brake_after_hit <= 1:
             raise PhysicsError(f"brake_after_hit must be in [0, 1], not {self.brake_after_hit!r}")
         if self.max_particles < PARTICLES_MIN:
@@ -334,6 +346,8 @@ def simulate_bodies(
     if ends is None:
         frames = max(round(options.duration * options.frame_rate), 1)
         ends = [frame / options.frame_rate for frame in range(1, frames + 1)]
+    for body in bodies:
+        _check_substeps(body, preset_of(options.preset).cfl, min(ends[-1], CONTACT_TIME))
     recorder = TrajectoryRecorder(simulator)
     recorder.record(0.0)
     stopped = "done"
@@ -350,6 +364,35 @@ def simulate_bodies(
         if on_progress is not None:
             on_progress(frame, len(ends))
     return recorder.result(options.start_us, stopped, _figures(options, simulator))
+
+
+def _check_substeps(body: DeformableBody, cfl: float, seconds: float) -> None:
+    """Raise PhysicsError if a body would need more than ``MAX_SUBSTEPS`` to deform for so long."""
+    rest, cell = body.rest, body.cell
+    modulus, viscosity = (
+        np.array([getattr(m, name) for m in body.materials])[body.regions]
+        for name in ("wave_modulus", "viscosity")
+    )
+    densities = rest.masses / rest.volumes
+    stiffest = int(np.argmax(modulus / densities))
+    wave = math.sqrt(modulus[stiffest] / densities[stiffest])
+    moving = float(np.linalg.norm(body.motion.velocity))
+    damping = float((viscosity / densities).max())
+    step = cfl * cell / (wave + moving)
+    if damping > 0:
+        step = min(step, VISCOUS_STEP * cell**2 / damping)
+    if seconds <= MAX_SUBSTEPS * step:
+        return
+    young = body.materials[body.regions[stiffest]].young
+    allowed = max(cfl * cell * MAX_SUBSTEPS / seconds - moving, 0.0)
+    softer = f"a Young's modulus of at most {young * (allowed / wave) ** 2:.2g} Pa, "
+    raise PhysicsError(
+        f"object {body.name!r}, with a Young's modulus of {young:.3g} Pa, a density of "
+        f"{densities[stiffest]:.3g} kg/m^3 and cells of {cell:.3g} m, needs "
+        f"{seconds / step:,.0f} substeps of {step * 1e6:.2g} us for {seconds:g} s; at most "
+        f"{MAX_SUBSTEPS:,} are allowed: take {softer * (0 < allowed < wave)}a larger density, "
+        f"larger cells (a smaller grid), or at most {MAX_SUBSTEPS * step:.2g} s"
+    )
 
 
 def _figures(options: SimulateOptions, simulator: HybridSimulator) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Self, TypeVar
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, InstanceOf, ValidationError, model_validator
 
-from real2sim_proto.base import Identifier
+from real2sim_proto.base import Identifier, invalid_reason
 from real2sim_proto.storyboard import (
     Choice,
     Distribution,
@@ -462,7 +462,9 @@ def _validated(
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
-        raise CommandError(f"{name} is not a valid {what}: {where}: {first['msg']}") from error
+        raise CommandError(
+            f"{name} is not a valid {what}: {where}: {invalid_reason(first)}"
+        ) from error
     except (TypeError, ValueError) as error:
         raise CommandError(f"{name} is not a valid {what}: {error}") from error
 

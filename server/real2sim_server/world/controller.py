@@ -385,7 +385,8 @@ class EgoController:
             raise WorldError(
                 ErrorCode.INVALID_ACTION,
                 f"the plan begins at {plan.times_us[0]} us; it is {t_us} us already",
-                hint="times_us are absolute simulation times after t_us of the observation",
+                hint="times_us are absolute simulation times after t_us of the observation; leave "
+                "out the present pose, which some planners put first (as those of nuPlan do)",
             )
         kept = tuple(p for p in self.pending if p.from_us < from_us)
         pending = (*kept, PendingPlan(from_us, plan_in_world(plan, motion)))

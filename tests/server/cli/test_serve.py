@@ -75,7 +75,7 @@ def test_an_unreachable_store_is_reported_without_a_traceback(serve, folders):
 def test_a_short_token_is_refused_without_revealing_it(serve, folders):
     done = serve(TOKEN="hunter2", **folders)
     assert done.exit_code == 1
-    assert "setting token" in done.printed
+    assert "setting token: it is shorter than 8 characters" in done.printed
     assert "hunter2" not in done.printed
 
 

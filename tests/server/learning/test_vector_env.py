@@ -162,3 +162,24 @@ def test_invalid_actions_seeds_and_masks_are_refused(street: Scene) -> None:
 
 def test_the_docstring_example_runs() -> None:
     assert doctest.testmod(learning).failed == 0
+
+
+@pytest.mark.parametrize("mode", list(AutoresetMode))
+def test_kept_observations_do_not_change(street: Scene, mode: AutoresetMode) -> None:
+    env = VectorDriveEnv(
+        2,
+        scene=street,
+        cameras=["front"],
+        size=(16, 16),
+        options={"horizon": 3},
+        autoreset_mode=mode,
+    )
+    kept = [env.reset(seed=0)[0]]
+    before = [{name: array.copy() for name, array in kept[0].items()}]
+    for _ in range(3):
+        kept.append(env.step(straight(2))[0])
+        before.append({name: array.copy() for name, array in kept[-1].items()})
+    env.reset(seed=1)
+    for now, then in zip(kept, before, strict=True):
+        for name, array in now.items():
+            np.testing.assert_array_equal(array, then[name], err_msg=name)

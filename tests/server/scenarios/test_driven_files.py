@@ -13,6 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 from real2sim.cli import build_app
+from real2sim_server.cli.drive import _print
 from real2sim_server.world.recording import Recording, load_recording
 
 DT = 0.1
@@ -887,3 +888,16 @@ def test_a_distance_without_limits_is_there_from_the_start(run, s):
     axle = 2.0 - (2.5 - 0.95)
     assert found[0].x == pytest.approx(90.0 + axle)
     assert found[-1].speed == pytest.approx(10.0)
+
+
+def test_events_at_one_instant_are_all_printed(capsys):
+    events = [
+        {"t": 1.0, "what": "story::brake", "change": "start", "type": "storyboard"},
+        {"t": 1.0, "what": "story::turn", "change": "start", "type": "storyboard"},
+        {"t": 1.0, "what": "car", "change": None, "type": "collision"},
+    ]
+    _print("a.xosc", {"events": events, "seconds": 2.0, "reason": "steps"})
+    printed = capsys.readouterr().out
+    assert [name in printed for name in ("brake start", "turn start", "car collision")] == [
+        True
+    ] * 3

@@ -216,7 +216,7 @@ Scenarios
     scenario.get_object("car_red")                          | .objects[
     car.move(x=1.0)                                         | .translate(
     car.translate(dx=1.0)                                   | x=
-    car.translate((1.0, 0.0, 0.0))                          | x: Input should be a valid number
+    car.translate((1.0, 0.0, 0.0))                          | x: must be a valid number
     car.scale(1.2)                                          | x, y, z, anchor
     car.rotate(yaw=0.26)                                    | angle=
     car.rotate(degrees=15)                                  | math.radians(

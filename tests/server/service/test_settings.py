@@ -16,6 +16,23 @@ def test_environment_variables_set_missing_values(monkeypatch):
     assert settings.token.get_secret_value() == "correct horse"
 
 
+def test_every_setting_loses_the_white_space_around_it(monkeypatch, tmp_path):
+    for name, value in {"HOST": "0.0.0.0", "LOG_LEVEL": "debug", "DEMO": "true"}.items():
+        monkeypatch.setenv(f"REAL2SIM_{name}", value + "\r")
+    (tmp_path / "token").write_bytes("\ufeffcorrect horse\r\n".encode())
+    found = Settings(store_url=" sqlite:///x\n", token_file=f"{tmp_path / 'token'}\r")
+    assert (found.host, found.log_level, found.demo) == ("0.0.0.0", "debug", True)
+    assert found.store_url == "sqlite:///x"
+    assert found.token.get_secret_value() == "correct horse"
+
+
+def test_a_setting_with_a_control_character_is_refused_by_its_name():
+    said = r"setting store_url: character 9 is U\+000A"
+    with pytest.raises(ValidationError, match=said) as error:
+        Settings(store_url="sqlite:/\n/hunter2")
+    assert "hunter2" not in str(error.value)
+
+
 @pytest.mark.parametrize("end", ["\r", "\r\n", " \n"])
 def test_the_line_ending_of_a_token_is_stripped(monkeypatch, tmp_path, end):
     monkeypatch.setenv("REAL2SIM_TOKEN", "correct horse" + end)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
@@ -15,12 +17,14 @@ from real2sim_server.simulation.structure import ObjectPhysics
 SOFT = FixedCorotated(young=2e5, poisson=0.3, viscosity=150.0)
 
 
-def box(name="box", position=(0.0, 0.0, 1.0), velocity=(0.0, 0.0, 0.0)) -> DeformableBody:
-    particles = box_particles((0.6, 0.6, 0.6), spacing=0.1, density=200.0)
+def box(
+    name="box", position=(0.0, 0.0, 1.0), velocity=(0.0, 0.0, 0.0), material=SOFT, density=200.0
+) -> DeformableBody:
+    particles = box_particles((0.6, 0.6, 0.6), spacing=0.1, density=density)
     return DeformableBody(
         name,
         particles,
-        [SOFT],
+        [material],
         np.zeros(len(particles), dtype=np.int64),
         friction=0.5,
         cell=0.2,
@@ -137,3 +141,29 @@ def test_a_rollout_is_reproducible():
 def test_invalid_arguments_are_refused(changes, message):
     with pytest.raises(PhysicsError, match=message):
         SimulateOptions(**{"objects": {"box": ObjectPhysics()}, **changes})
+
+
+@pytest.mark.parametrize(
+    ("young", "density", "seconds"), [(1e12, 200.0, 1.0), (2e5, 1e-9, 1.0), (1e10, 200.0, 1e9)]
+)
+def test_a_rollout_of_too_many_substeps_is_refused_at_once(young, density, seconds):
+    body = box(material=FixedCorotated(young=young, poisson=0.3), density=density)
+    said = rf"Young's modulus of {young:.3g} Pa.*substeps of .* at most 200,000".replace("+", r"\+")
+    with pytest.raises(PhysicsError, match=said):
+        # Frames at two times, because a list of all of them would be long itself.
+        simulate_bodies([body], options(body, times_s=[seconds / 2, seconds]))
+
+
+def test_the_softest_material_that_the_refusal_names_is_accepted():
+    body = box(material=FixedCorotated(young=1e12, poisson=0.3))
+    with pytest.raises(PhysicsError) as caught:
+        simulate_bodies([body], options(body, times_s=[1.0]))
+    [most] = re.findall(r"modulus of at most (\S+) Pa", str(caught.value))
+    kept = box(material=FixedCorotated(young=0.95 * float(most), poisson=0.3))
+    done = simulate_bodies([kept], options(kept, times_s=[1.0]), cancelled=lambda: True)
+    assert done.stopped == "cancelled"
+
+
+def test_a_rollout_of_too_many_frames_is_refused_at_once():
+    with pytest.raises(PhysicsError, match=r"30,000,000,000 frames; at most 100,000"):
+        options(box(), duration=1e9)

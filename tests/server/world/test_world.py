@@ -123,6 +123,7 @@ def test_a_plan_for_the_past_is_refused(make_world):
         world.step(TrajectoryPlan(times_us=[5_000_000], poses=[(1, 0, 0)]))
 
     assert refused.value.code == ErrorCode.INVALID_ACTION
+    assert "leave out the present pose" in refused.value.hint
 
 
 def test_the_episode_ends_at_the_end_of_the_log(make_world):

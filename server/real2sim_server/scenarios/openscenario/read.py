@@ -11,6 +11,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from real2sim_proto.base import invalid_reason
 from real2sim_proto.storyboard import Storyboard, resolved, story_actions
 from real2sim_proto.storyboard_actions import SpeedAction
 
@@ -419,7 +420,7 @@ def _validated(fields: Fields, file: str) -> Storyboard:
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
-        raise ScenarioError(f"{file}: {where or 'storyboard'}: {first['msg']}") from error
+        raise ScenarioError(f"{file}: {where or 'storyboard'}: {invalid_reason(first)}") from error
 
 
 def _header(whole: Part) -> Fields:

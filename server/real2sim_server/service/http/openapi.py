@@ -361,7 +361,7 @@ def text_of(made: dict[str, Any]) -> str:
     return json.dumps(made, indent=1, sort_keys=True) + "\n"
 
 
-STYLE = "/ui/docs.css"
+STYLE = "ui/docs.css"
 POLICY = (
     "default-src 'none'; style-src 'self'; base-uri 'none'; form-action 'none'; "
     "frame-ancestors 'none'"
@@ -382,7 +382,7 @@ def reference_page(made: dict[str, Any]) -> str:
             '<meta name="viewport" content="width=device-width, initial-scale=1">',
             f'<link rel="stylesheet" href="{STYLE}"></head><body>',
             f"<h1>{escape(info['title'])} <small>{escape(info['version'])}</small></h1>",
-            '<p>The same for programs: <a href="/openapi.json">openapi.json</a>. In the examples '
+            '<p>The same for programs: <a href="openapi.json">openapi.json</a>. In the examples '
             "<code>$WORKER</code> is the address of this worker, <code>$REAL2SIM_TOKEN</code> its "
             "token, if it has one, and <code>$SESSION_TOKEN</code> the <code>token</code> in the "
             "answer that made the session.</p>",

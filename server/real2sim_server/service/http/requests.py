@@ -19,7 +19,7 @@ from fastapi import FastAPI, Header, Response
 from pydantic import BaseModel
 from starlette.datastructures import FormData, Headers, MutableHeaders
 from starlette.exceptions import HTTPException
-from starlette.requests import Request
+from starlette.requests import HTTPConnection, Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from real2sim_proto import ErrorCode
@@ -107,6 +107,8 @@ class RequestContext:
                 status = message["status"]
                 headers = MutableHeaders(scope=message)
                 headers[REQUEST_ID_HEADER] = request_id
+                if headers.get("Location", "").startswith("/"):
+                    headers["Location"] = forwarded_prefix(scope) + headers["Location"]
                 secure(headers)
             elif method == "HEAD":
                 if ended:
@@ -141,6 +143,20 @@ class RequestContext:
             **_session(scope),
             ms=round(seconds * 1e3, 2),
         )
+
+
+_PREFIX = re.compile(r"(/[A-Za-z0-9._~-]+)+")
+
+
+def forwarded_prefix(scope: Scope) -> str:
+    """Path below which a proxy serves the worker, such as ``/sim``; empty for none."""
+    given = Headers(scope=scope).get("X-Forwarded-Prefix", "").rstrip("/")
+    return given if _PREFIX.fullmatch(given) else ""
+
+
+def base_url(connection: HTTPConnection) -> str:
+    """Address of the worker for the client, without a slash at its end."""
+    return str(connection.base_url).rstrip("/") + forwarded_prefix(connection.scope)
 
 
 class BodyLimit:

@@ -19,6 +19,7 @@ from starlette.requests import ClientDisconnect
 from starlette.routing import Match
 
 from real2sim_proto import HTTP_STATUS, PROBLEM_MEDIA_TYPE, RETRYABLE, ErrorCode, Problem
+from real2sim_proto.base import invalid_reason
 from real2sim_proto.errors import ProblemDetail, title_of
 
 from ...datasets.drive import DatasetError
@@ -294,16 +295,16 @@ def install_problem_handlers(app: FastAPI) -> None:
 
 def _of_framework(request: Request, error: Exception) -> ServiceError:
     if isinstance(error, RequestValidationError):
-        return _of_validation(error)
+        return _of_validation(request, error)
     if isinstance(error, HTTPException):
         return _of_http(request, error)
     return service_error(error)
 
 
-def _of_validation(error: RequestValidationError) -> ServiceError:
+def _of_validation(request: Request, error: RequestValidationError) -> ServiceError:
     found = error.errors()
     details = [
-        ProblemDetail(pointer=_pointer(e, error.body), message=_message(e))
+        ProblemDetail(pointer=_pointer(e, error.body), message=_message(request, e))
         for e in found[:MAX_DETAILS]
     ]
     first = ": ".join(filter(None, (details[0].pointer, details[0].message)))
@@ -316,10 +317,16 @@ def _of_validation(error: RequestValidationError) -> ServiceError:
     )
 
 
-def _message(error: Mapping[str, Any]) -> str:
+def _message(request: Request, error: Mapping[str, Any]) -> str:
     if error["type"] == "json_invalid":
         return f"not valid JSON: {error.get('ctx', {}).get('error', error['msg'])}"
-    return str(error["msg"]).removeprefix("Value error, ")
+    name = error["loc"][-1] if error["loc"] else ""
+    if error["type"] == "extra_forbidden" and error["loc"] == ("body", name):
+        asked = request.scope["route"].dependant.query_params
+        if any(parameter.alias == name for parameter in asked):
+            address = f"{request.method} {request.url.path}?{name}=..."
+            return f"belongs in the address, not in the body: {address}"
+    return invalid_reason(error)
 
 
 def _pointer(error: Mapping[str, Any], body: Any) -> str:

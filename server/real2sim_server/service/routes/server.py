@@ -164,8 +164,8 @@ ui_router = APIRouter(include_in_schema=False)
 @ui_router.get("/")
 @ui_router.get("/ui")
 async def entry() -> Response:
-    """Redirect to the studio; relative links need the slash."""
-    return RedirectResponse("/ui/")
+    """Redirect to the studio, relative because a proxy may serve it below a path."""
+    return RedirectResponse("ui/")
 
 
 @ui_router.get("/ui/{name:path}")

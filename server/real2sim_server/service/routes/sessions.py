@@ -38,7 +38,7 @@ from ..http.auth import (
     require_token,
     unauthorized,
 )
-from ..http.requests import ClientName, IdempotencyKey, IdempotentRequest
+from ..http.requests import ClientName, IdempotencyKey, IdempotentRequest, base_url
 from ..http.responses import ServiceError, choose_among, etag, info_response, large_response
 from ..jobs import accepted_headers
 from ..renderer import CODEC_OF, choose_media_type
@@ -400,7 +400,7 @@ def _own_url(request: Request) -> str:
 
 
 def _ws_base(request: Request) -> str:
-    return str(request.base_url).rstrip("/").replace("http", "ws", 1)
+    return base_url(request).replace("http", "ws", 1)
 
 
 MSGPACK = "application/msgpack"

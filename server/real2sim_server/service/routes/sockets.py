@@ -19,7 +19,7 @@ from pydantic import Field, TypeAdapter, ValidationError
 from structlog.contextvars import bound_contextvars
 
 from real2sim_proto import SUPPORTED_SUBPROTOCOLS, ErrorCode
-from real2sim_proto.base import Identifier, Microseconds, Model
+from real2sim_proto.base import Identifier, Microseconds, Model, invalid_reason
 from real2sim_proto.episode import SensorSpec
 from real2sim_proto.operations import Operation
 
@@ -34,6 +34,7 @@ from ..engine import QueueFullError
 from ..frames import EncodedFrame
 from ..http.auth import act_for, bearer_token, unauthorized
 from ..http.connections import close_quietly, receive_text
+from ..http.requests import base_url
 from ..http.responses import REQUEST_ID_KEY, ServiceError, problem_response, service_error
 from ..renderer import RenderRequest
 from ..sessions.connection import Connection
@@ -107,8 +108,7 @@ async def _serve_drive(
         raise FatalError(service_error(error, log_unexpected=True), message_id=hello.id) from error
     started, first = time.perf_counter(), _steps(session)
     log.info("drive socket opened", role=hello.role)
-    ws_base = str(socket.base_url).rstrip("/")
-    connection = Connection(socket, session, worker.sessions, ws_base=ws_base)
+    connection = Connection(socket, session, worker.sessions, ws_base=base_url(socket))
     try:
         with ended_when_revoked(connection, account):
             await connection.serve(hello)
@@ -269,7 +269,7 @@ class ViewConnection:
                 first = error.errors()[0]
                 where = ".".join(str(part) for part in first["loc"])
                 await self._send_event(
-                    "error", code="INVALID_REQUEST", detail=f"{where}: {first['msg']}"
+                    "error", code="INVALID_REQUEST", detail=f"{where}: {invalid_reason(first)}"
                 )
                 continue
             self._pending["pick" if request.pick else "picture"] = request

@@ -20,6 +20,7 @@ from real2sim_proto import (
     decode,
     protocol_mismatch,
 )
+from real2sim_proto.base import invalid_reason
 from real2sim_proto.codec import MAX_CLIENT_MESSAGE_BYTES, unpack
 from real2sim_proto.drive import CLIENT_MESSAGE, Action, ClientMessage, Envelope, Hello
 
@@ -145,14 +146,12 @@ def _id_of(fields: dict[str, Any]) -> int:
 
 
 def validation_summary(error: ValidationError) -> str:
-    """The error and its location: ``action/plan/poses/0/1: input should be a finite number``."""
+    """The error and its location: ``action/plan/poses/0/1: must be a finite number, got NaN``."""
     found = error.errors(include_url=False, include_context=False)
     texts = []
     for problem in found[:MAX_PROBLEMS]:
         place = "/".join(str(part) for part in problem["loc"]) or "message"
-        given = repr(problem["input"])
-        shown = f" (given: {given})" if len(given) <= 60 else ""
-        texts.append(f"{place}: {problem['msg']}{shown}")
+        texts.append(f"{place}: {invalid_reason(problem)}")
     more = f"; and {len(found) - MAX_PROBLEMS} more" if len(found) > MAX_PROBLEMS else ""
     return "; ".join(texts) + more
 

@@ -306,7 +306,7 @@ class Session:
 
     row: SessionRow
     start: EpisodeStart
-    resume_token: str
+    resume_token: str = field(repr=False)
     lock: asyncio.Lock = field(default_factory=asyncio.Lock)
     world: World | None = None
     cameras: dict[str, Camera] = field(default_factory=dict)

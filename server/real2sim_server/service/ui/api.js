@@ -1,5 +1,7 @@
 // Calls of the worker's REST interface. Problems become sentences.
 const KEY = "real2sim-token";
+// Address of the worker, without a slash at its end; a proxy may serve it below a path.
+export const WORKER = new URL("..", import.meta.url).href.replace(/\/$/, "");
 export const token = () => sessionStorage.getItem(KEY) ?? "";
 
 export class ApiError extends Error {
@@ -28,7 +30,7 @@ export async function call(method, path, { body, headers = {}, accept = "applica
   let answer;
   try {
     const content = body === undefined ? undefined : JSON.stringify(body);
-    answer = await fetch(path, { method, headers: given, body: content });
+    answer = await fetch(WORKER + path, { method, headers: given, body: content });
   } catch {
     throw new Error("The worker does not answer. Is it still running?");
   }

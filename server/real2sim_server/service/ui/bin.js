@@ -1,5 +1,5 @@
 // Deletion with undo: the object is deleted when the message disappears or the page closes.
-import { call, token } from "./api.js";
+import { call, token, WORKER } from "./api.js";
 import { attempt, notify } from "./messages.js";
 
 const AFTER_MS = 8000;
@@ -37,7 +37,7 @@ addEventListener("pagehide", () => {
   const gone = JSON.parse(sessionStorage.getItem(KEY) ?? "[]");
   for (const [path, timer] of waiting) {
     clearTimeout(timer);
-    fetch(path, { method: "DELETE", headers, keepalive: true });
+    fetch(WORKER + path, { method: "DELETE", headers, keepalive: true });
     gone.push(path);
   }
   waiting.clear();

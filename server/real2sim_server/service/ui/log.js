@@ -1,4 +1,5 @@
 // The history: every revision, as Python and as curl.
+import { WORKER } from "./api.js";
 import { model, on } from "./model.js";
 import { el } from "./dom.js";
 import { notify, attempt } from "./messages.js";
@@ -82,7 +83,7 @@ export function asPython(batches) {
   return [
     "import real2sim",
     "",
-    `with real2sim.connect(${python(location.origin)}) as sim:`,
+    `with real2sim.connect(${python(WORKER)}) as sim:`,
     `    scenario = sim.scenarios.create(scene=${python(scene)}, name=${python(name)})`,
     ...calls,
     "",
@@ -110,10 +111,10 @@ export function asCurl(batches) {
   const quoted = (body) => `'${JSON.stringify(body).replaceAll("'", "'\\''")}'`;
   const call = (path, body) =>
     `curl -sf -X POST ${path} -H 'Content-Type: application/json' \\\n     -d ${quoted(body)}`;
-  const made = call(`${location.origin}/v1/scenarios`, { scene, name: `${name} (copy)` });
+  const made = call(`${WORKER}/v1/scenarios`, { scene, name: `${name} (copy)` });
   const id = `ID=$(${made} | sed -E 's/.*"scenario_id": ?"([^"]+)".*/\\1/')`;
   const edits = batches.map((batch) =>
-    call(`${location.origin}/v1/scenarios/$ID/operations`, { operations: batch.map(withoutNulls) }),
+    call(`${WORKER}/v1/scenarios/$ID/operations`, { operations: batch.map(withoutNulls) }),
   );
   return [id, ...edits, ""].join("\n");
 }

@@ -1,5 +1,5 @@
 // The view socket: the newest request is sent once the last answer has arrived.
-import { token } from "./api.js";
+import { token, WORKER } from "./api.js";
 
 export class ViewSocket {
   constructor(id, { onFrame, onPick, onChanged, onError, onGone }) {
@@ -17,7 +17,7 @@ export class ViewSocket {
     this.connect();
   }
   connect() {
-    const base = location.origin.replace(/^http/, "ws");
+    const base = WORKER.replace(/^http/, "ws");
     this.socket = new WebSocket(`${base}/v1/scenarios/${encodeURIComponent(this.id)}/view`);
     this.socket.binaryType = "arraybuffer";
     this.ready = false;

@@ -130,3 +130,20 @@ def test_each_request_gets_one_log_line(client, logged):
     client.get("/v1/server")
     (line,) = [entry for entry in logged if entry["event"] == "request"]
     assert (line["method"], line["path"], line["status"]) == ("GET", "/v1/server", 200)
+
+
+def test_a_query_parameter_in_the_body_is_told_where_it_belongs(client):
+    for name in ("scene", "scenario"):
+        problem = problem_of(client.post("/v1/sessions", json={name: "tiny"}))
+        said = f"belongs in the address, not in the body: POST /v1/sessions?{name}=..."
+        assert problem.detail == f"/{name}: {said}"
+
+
+def test_a_number_that_is_none_is_refused_in_words(client):
+    response = client.post(
+        "/v1/sessions?scene=tiny",
+        content=b'{"reset": {"ego": {"max_steer": NaN}}}',
+        headers={"Content-Type": "application/json"},
+    )
+    said = "/reset/ego/max_steer: must be a finite number, got NaN"
+    assert problem_of(response).detail == said

@@ -24,7 +24,7 @@ def test_check_env_passes(env):
     from gymnasium.utils.env_checker import check_env
 
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message=".*(unwrapped|render modes|infinity).*")
+        warnings.simplefilter("error")
         check_env(env, skip_render_check=True)
 
 
@@ -76,6 +76,36 @@ def test_changing_an_observation_does_not_affect_the_next(site):
         later = made.step(np.zeros(2, np.float32))[0]["front"]
         assert later is not obs["front"]
         np.testing.assert_array_equal(later, first)
+    finally:
+        made.close()
+
+
+def test_kept_observations_do_not_change(site):
+    slow = {"camera": "front", "period_us": 300_000, "modalities": ["rgb", "depth"]}
+    made = real2sim.make_env(
+        url=site.url,
+        scene="tiny",
+        sensors=[slow, "left"],
+        lidars=["vlp-16"],
+        radars=["corner"],
+        points=64,
+        agents=4,
+    )
+    try:
+        kept = [made.reset(seed=0)[0]]
+        before = [{name: array.copy() for name, array in kept[0].items()}]
+        nothing = np.zeros(2, np.float32)
+        for take in (*[lambda: made.step(nothing)[0]] * 4, lambda: made.reset(seed=1)[0]):
+            kept.append(take())
+            before.append({name: array.copy() for name, array in kept[-1].items()})
+        for now, then in zip(kept, before, strict=True):
+            assert set(now) == set(made.observation_space.spaces)
+            for name, array in now.items():
+                assert array.flags.writeable
+                np.testing.assert_array_equal(array, then[name], err_msg=name)
+        arrays = [array for obs in kept for array in obs.values()]
+        pairs = ((a, b) for k, a in enumerate(arrays) for b in arrays[:k])
+        assert not any(np.shares_memory(a, b) for a, b in pairs)
     finally:
         made.close()
 
@@ -171,7 +201,7 @@ def test_the_registered_environment_passes_check_env(site):
     env = gymnasium.make("real2sim.env:real2sim/Drive-v0", url=site.url, scene="tiny")
     assert env.spec.id == "real2sim/Drive-v0"
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message=".*(unwrapped|render modes|infinity).*")
+        warnings.simplefilter("error")
         check_env(env.unwrapped, skip_render_check=True)
     env.close()
 

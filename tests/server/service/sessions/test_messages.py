@@ -75,3 +75,11 @@ def test_other_messages_are_handled_like_by_the_general_parser(data):
         return messages.ReceivedMessage(message, content)
 
     assert outcome(read_message, data) == outcome(slowly, data)
+
+
+def test_an_action_that_is_not_a_number_is_refused_in_words():
+    plan = {"kind": "control", "acceleration": 1.0, "steering": float("nan")}
+    with pytest.raises(BadMessageError) as caught:
+        read_message(encode(ACTION | {"plan": plan}))
+    said = "action/plan/control/steering: must be a finite number, got NaN"
+    assert caught.value.error.detail == said

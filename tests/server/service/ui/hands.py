@@ -56,3 +56,27 @@ def address(page: Any) -> dict[str, str]:
 def wait_address(page: Any, **values: str) -> None:
     """Wait until the URL has this state."""
     wait_until(lambda: values.items() <= address(page).items(), lambda: f"{values} in {page.url}")
+
+
+def behind(app: Any, prefix: str, *, forwarded: bool) -> Any:
+    """The application as seen through a proxy that removes a prefix from paths.
+
+    Args:
+        app: ASGI application.
+        prefix: path without a slash at its end; only ``/readyz`` is found outside of it.
+        forwarded: whether the proxy sends ``X-Forwarded-Prefix``.
+    """
+
+    async def proxy(scope: Any, receive: Any, send: Any) -> None:
+        if scope["type"] == "lifespan" or scope["path"] == "/readyz":
+            await app(scope, receive, send)
+            return
+        inside = scope["path"].startswith(prefix + "/")
+        path = scope["path"].removeprefix(prefix) if inside else "/outside"
+        headers = [*scope["headers"]]
+        if forwarded:
+            headers.append((b"x-forwarded-prefix", f"{prefix}/".encode()))
+        changes = {"path": path, "raw_path": path.encode(), "headers": headers}
+        await app({**scope, **changes}, receive, send)
+
+    return proxy

@@ -3,10 +3,14 @@ from __future__ import annotations
 import re
 from hashlib import sha256
 from pathlib import Path
+from urllib.parse import urljoin, urlsplit
 
 import pytest
+from fastapi.testclient import TestClient
 
 from real2sim_server.service.routes.server import FOLDER, STUDIO
+
+from .hands import behind
 
 OWN = sorted(name for name in STUDIO if not name.startswith("vendor/"))
 """Own files. Vendored files are unmodified."""
@@ -28,7 +32,67 @@ def test_the_page_has_a_restrictive_content_security_policy(client):
 def test_the_root_redirects_to_the_page(client):
     for path in ("/", "/ui"):
         answer = client.get(path, follow_redirects=False)
-        assert (answer.status_code, answer.headers["location"]) == (307, "/ui/")
+        assert (answer.status_code, answer.headers["location"]) == (307, "ui/")
+
+
+def pages_from(client, entry):
+    """Follow the links of a page; the paths that answer."""
+    waiting, seen = [entry], {}
+    while waiting:
+        path = waiting.pop()
+        answer = client.get(path)
+        assert answer.status_code == 200, path
+        seen[str(answer.url.path)] = answer.text
+        if not answer.headers["content-type"].startswith("text/html"):
+            continue
+        for link in re.findall(r'(?:href|src)="([^"#?]+)"', answer.text):
+            to = urljoin(str(answer.url), link)
+            if (found := urlsplit(to).path) not in seen and found not in waiting:
+                waiting.append(found)
+    return seen
+
+
+@pytest.mark.parametrize("forwarded", [False, True])
+def test_pages_work_below_the_path_of_a_proxy(client, forwarded):
+    proxied = TestClient(
+        behind(client.app, "/sim", forwarded=forwarded), base_url=str(client.base_url)
+    )
+    seen = pages_from(proxied, "/sim/")
+    assert {"/sim/ui/", "/sim/ui/main.js", "/sim/ui/studio.css"} <= seen.keys()
+    assert {"/sim/docs", "/sim/ui/docs.css", "/sim/openapi.json"} <= pages_from(
+        proxied, "/sim/docs"
+    ).keys()
+
+
+def test_a_proxy_that_names_its_path_gets_addresses_below_it(client):
+    proxied = TestClient(behind(client.app, "/sim", forwarded=True), base_url=str(client.base_url))
+    made = proxied.post("/sim/v1/sessions?scene=tiny")
+    name = made.json()["session_id"]
+    assert made.headers["Location"] == f"/sim/v1/sessions/{name}"
+    host = client.base_url.netloc.decode()
+    assert made.json()["ws_url"] == f"ws://{host}/sim/v1/sessions/{name}/drive"
+    headers = {"Authorization": f"Bearer {made.json()['token']}"}
+    assert proxied.get(made.headers["Location"], headers=headers).status_code == 200
+
+
+@pytest.mark.parametrize("given", ["//other.example", "/a b", "sim", "/sim/../x?y", "/\u00e4"])
+def test_other_prefixes_are_ignored(client, given):
+    answer = client.post(
+        "/v1/scenarios", json={"scene": "tiny"}, headers={"X-Forwarded-Prefix": given.encode()}
+    )
+    assert answer.headers["Location"].startswith("/v1/scenarios/")
+
+
+@pytest.mark.parametrize("name", OWN)
+def test_no_file_holds_an_address_from_the_root_of_the_host(name):
+    content = text(name)
+    assert re.findall(r'(?:href|src)="/|url\(["\']?/|from "/|import\("/', content) == []
+    if name.endswith(".js"):
+        # Paths of the REST interface are appended to the address of the worker.
+        assert "location.origin" not in content
+        assert "location.host" not in content
+        assert re.findall(r"fetch\((?!WORKER \+)", content) == []
+        assert re.findall(r"new WebSocket\((?!`\$\{base\})", content) == []
 
 
 def test_the_page_needs_no_token_but_its_data_does(start_worker):

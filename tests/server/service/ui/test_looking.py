@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from typing import Any
+from urllib.parse import urlsplit
 
 import httpx2
 import pytest
 
+from real2sim_server.service import serve
+from real2sim_server.service.app import create_app
 from real2sim_server.service.serve import running_worker
 from tests.waiting import wait_until
 
-from .hands import address, enter, field, kept, shown, wait_address
+from .hands import address, behind, enter, field, kept, shown, wait_address
 
 pytestmark = [pytest.mark.browser, pytest.mark.network]
 
@@ -75,3 +78,25 @@ def test_a_refused_edit_creates_no_scenario(looking, running):
     wait_address(looking, t=str(shown(looking, "model.t")))
     assert "scenario" not in address(looking)
     assert not looking.is_visible("#gone")
+
+
+def test_the_studio_works_below_the_path_of_a_proxy(visit, make_settings, monkeypatch):
+    def create_behind_proxy(settings):
+        app = create_app(settings)
+        app.add_middleware(lambda inner: behind(inner, "/sim", forwarded=False))
+        return app
+
+    monkeypatch.setattr(serve, "create_app", create_behind_proxy)
+    with running_worker(make_settings()) as worker:
+        page = visit(f"{worker.url}/sim/")
+        asked: list[str] = []
+        page.on("request", lambda request: asked.append(urlsplit(request.url).path))
+        page.on("websocket", lambda socket: asked.append(urlsplit(socket.url).path))
+        page.click("[data-scene=tiny]")
+        page.wait_for_selector("body[data-ready]")
+        page.evaluate("async () => (await import('/sim/ui/model.js')).own()")
+        kept(page, 0)
+        page.wait_for_selector("#picture[data-seq]")
+    assert any(path.startswith("/sim/v1/scenarios/") and path.endswith("/view") for path in asked)
+    # Pictures have addresses of blobs, without a path.
+    assert [path for path in asked if path.startswith("/") and not path.startswith("/sim/")] == []
