@@ -36,7 +36,7 @@ class WorkerTarget:
     """
 
     url: str
-    token: str | None = None
+    token: str | None = field(default=None, repr=False)
     sessions: int = 2
     timeout: float = 120.0
 
