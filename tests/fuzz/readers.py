@@ -353,8 +353,8 @@ def read_proto(path: Path) -> None:
 
 
 def read_records(path: Path) -> None:
-    from real2sim_server.logs.readers.common import LeftOut
     from real2sim_server.logs.readers.waymo_v1 import list_records, read_record
+    from real2sim_server.scene.errors import LeftOut
 
     for record in list_records(path, LeftOut()):
         read_record(path, record)

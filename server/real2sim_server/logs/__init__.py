@@ -18,7 +18,7 @@ from .driving_log import (
     same_part,
     select_from_log,
 )
-from .inspect import CameraReport, LogReport, inspect_log, inspected_frames
+from .inspect import CameraReport, LogReport, inspect_log
 from .open import open_log
 from .readers.native import write_native_log
 
@@ -36,7 +36,6 @@ __all__ = [
     "ObjectTrack",
     "check_log",
     "inspect_log",
-    "inspected_frames",
     "log_of_frames",
     "open_log",
     "same_part",

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ..geometry import Float
 from ..scene import CameraRig, LaneGraph, Trajectory
+from ..scene.errors import FileError
 
 NAMED = 5
 """Maximum number of records of a kind to name in a summary."""
@@ -29,7 +30,7 @@ def left_out_lines(left_out: Mapping[str, Sequence[str]]) -> list[str]:
     return lines
 
 
-class LogError(ValueError):
+class LogError(FileError):
     """A log that cannot be read; the message names the file, the problem and the expectation."""
 
 

@@ -106,7 +106,7 @@ class LogReport:
         return lines
 
 
-def inspected_frames(log: DrivingLog) -> tuple[int, ...]:
+def _inspected_frames(log: DrivingLog) -> tuple[int, ...]:
     """The frames that :func:`inspect_log` reads: first, middle and last of the complete ones."""
     frames = [f for f in log.seen_frames() if f not in log.absent_sweeps]
     frames = frames or list(range(log.frame_count))
@@ -125,7 +125,7 @@ def inspect_log(log: DrivingLog, out: str | Path | None = None) -> LogReport:
     """
     sweeps: dict[int, LidarSweep] = {}
     problems: list[str] = []
-    for frame in inspected_frames(log):
+    for frame in _inspected_frames(log):
         try:
             sweeps[frame] = log.lidar(frame)
         except LogError as error:

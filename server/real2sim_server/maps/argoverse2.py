@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +11,8 @@ from real2sim_proto.lanes import LaneKind
 
 from ..geometry import Float
 from ..scene import Area, Lane, LaneGraph
+from ..scene.errors import LeftOut
 from .reader import (
-    LeavingOut,
-    LeftOut,
     MapError,
     between,
     check_rest,
@@ -50,21 +48,21 @@ class Argoverse2MapReader:
 
 
 def _graph(content: dict[str, Any], file: Path) -> LaneGraph:
-    left_out: LeftOut = defaultdict(list)
+    left_out = LeftOut()
     segments = content["lane_segments"]
     lanes: list[Lane] = []
     for key, entry in segments.items():
-        with LeavingOut(left_out["lane segments left out because they cannot be read"], str(key)):
+        with left_out.damaged("lane segments left out because they cannot be read", str(key)):
             lanes.append(_lane(entry, segments, left_out))
     if not segments:
         raise MapError(f"{file}: has no lane segments")
     check_rest(str(file), "lane segments", lanes, segments, left_out)
     areas: list[Area] = []
     for key, entry in _table(content, "drivable_areas", left_out).items():
-        with LeavingOut(left_out["drivable areas left out because they cannot be read"], str(key)):
+        with left_out.damaged("drivable areas left out because they cannot be read", str(key)):
             areas.append(Area(str(entry["id"]), "drivable", _points(entry["area_boundary"])))
     for key, entry in _table(content, "pedestrian_crossings", left_out).items():
-        with LeavingOut(left_out["crossings left out because they cannot be read"], str(key)):
+        with left_out.damaged("crossings left out because they cannot be read", str(key)):
             one, other = (_points(entry[edge]) for edge in ("edge1", "edge2"))
             outline = np.concatenate([one, other[::-1]])
             areas.append(Area(f"crossing_{entry['id']}", "crosswalk", outline))
@@ -96,7 +94,7 @@ def _lane(entry: dict[str, Any], segments: dict[str, Any], left_out: LeftOut) ->
         if (other := segments.get(str(name))) is None:
             beside[side] = str(name)
             continue
-        with LeavingOut(left_out["neighbours left out because they cannot be read"], str(name)):
+        with left_out.damaged("neighbours left out because they cannot be read", str(name)):
             same = _direction(entry) @ _direction(other) > 0
             if same or side == "left":
                 beside[side if same else "opposite"] = str(other["id"])

@@ -16,9 +16,8 @@ from real2sim_proto.lanes import AreaKind, LaneKind, SignalKind
 
 from ..geometry import Float
 from ..scene import Area, Lane, LaneGraph, Signal, StopLine
+from ..scene.errors import LeftOut
 from .reader import (
-    LeavingOut,
-    LeftOut,
     MapError,
     between,
     check_rest,
@@ -117,11 +116,11 @@ class _Osm:
     relations: dict[str, _Relation]
     origin: str = ""
     way_of: dict[tuple[str, ...], str] = field(default_factory=dict)
-    left_out: LeftOut = field(default_factory=dict)
+    left_out: LeftOut = field(default_factory=LeftOut)
 
     @classmethod
     def of(cls, root: ET.Element, file: str) -> _Osm:
-        left_out: LeftOut = defaultdict(list)
+        left_out = LeftOut()
         nodes, drawn, related = (
             _kept(root, kind, left_out) for kind in ("node", "way", "relation")
         )
@@ -185,7 +184,7 @@ def _places(nodes: Iterable[ET.Element], left_out: LeftOut) -> tuple[dict[str, F
     degrees: dict[str, tuple[float, float, float]] = {}
     for node in nodes:
         key, tags = node.get("id", ""), _tags(node)
-        with LeavingOut(left_out["nodes left out because they cannot be read"], key):
+        with left_out.damaged("nodes left out because they cannot be read", key):
             height = _value(tags, "ele", "0")
             if "local_x" in tags and "local_y" in tags:
                 local[key] = np.array([_value(tags, "local_x"), _value(tags, "local_y"), height])
@@ -232,7 +231,7 @@ def _graph(osm: _Osm, name: str) -> LaneGraph:
     areas: dict[str, Area] = {}
     index = _Index(rims)
     for key, pair in rims.items():
-        with LeavingOut(osm.left_out["lanelets left out because they cannot be read"], key):
+        with osm.left_out.damaged("lanelets left out because they cannot be read", key):
             if lanelets[key].tags.get("subtype") == "crosswalk":
                 left, right = _oriented(osm, *pair)
                 areas[key] = Area(key, "crosswalk", np.concatenate([left, right[::-1]]))
@@ -244,7 +243,7 @@ def _graph(osm: _Osm, name: str) -> LaneGraph:
     if not lanes:
         raise MapError(f"{osm.file}: has no lanelets except crosswalks")
     for key, relation in osm.relations.items():
-        with LeavingOut(osm.left_out["areas left out because they cannot be read"], key):
+        with osm.left_out.damaged("areas left out because they cannot be read", key):
             if (area := _area(osm, key, relation)) is not None:
                 areas[area.area_id] = area
     stop_lines, signals = _rules(osm, lanelets, set(lanes))
@@ -457,7 +456,7 @@ def _rules(
         if stop is not None and len(osm.ways[stop]) >= 2:
             known = lines.get(stop)
             both = (*(known.lanes if known else ()), *waiting)
-            with LeavingOut(osm.left_out["stop lines left out because they cannot be read"], stop):
+            with osm.left_out.damaged("stop lines left out because they cannot be read", stop):
                 lines[stop] = StopLine(stop, osm.line(stop), both)
         refers = osm.member_ways(rule, "refers") or ([stop] if stop is not None else [])
         if not refers or not len(osm.ways[refers[0]]):
@@ -466,7 +465,7 @@ def _rules(
         line = osm.line(refers[0])
         x, y, z = line.mean(axis=0).tolist()
         along = line[-1] - line[0]
-        with LeavingOut(osm.left_out["signals left out because they cannot be read"], key):
+        with osm.left_out.damaged("signals left out because they cannot be read", key):
             signals[key] = Signal(
                 key, kind, (x, y, z), math.atan2(along[1], along[0]) - math.pi / 2, tuple(waiting),
                 stop if stop in lines else None,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import defaultdict
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
@@ -15,9 +14,8 @@ from real2sim_proto.lanes import AreaKind
 
 from ..geometry import Float
 from ..scene import Area, Lane, LaneGraph, Signal, StopLine
+from ..scene.errors import LeftOut
 from .reader import (
-    LeavingOut,
-    LeftOut,
     MapError,
     check_rest,
     damage_named,
@@ -76,14 +74,14 @@ class NuScenesMapReader:
 class _Tables:
     def __init__(self, content: dict[str, Any]) -> None:
         self.content = content
-        self.left_out: LeftOut = defaultdict(list)
+        self.left_out = LeftOut()
         self.nodes: dict[str, tuple[float, float, float]] = {}
         self.rings: dict[str, Float] = {}
         for name, n in self._read("node"):
-            with self._leaving_out("nodes", name):
+            with self.left_out.damaged("nodes left out because they cannot be read", name):
                 self.nodes[n["token"]] = (float(n["x"]), float(n["y"]), 0.0)
         for name, p in self._read("polygon"):
-            with self._leaving_out("polygons", name):
+            with self.left_out.damaged("polygons left out because they cannot be read", name):
                 ring = [self.nodes[node] for node in p["exterior_node_tokens"]]
                 self.rings[p["token"]] = np.array(ring).reshape(-1, 3)
 
@@ -92,9 +90,6 @@ class _Tables:
         for i, row in enumerate(self.rows(table)):
             known = isinstance(row, dict) and "token" in row
             yield str(row["token"]) if known else f"row {i}", row
-
-    def _leaving_out(self, what: str, name: str) -> LeavingOut:
-        return LeavingOut(self.left_out[f"{what} left out because they cannot be read"], name)
 
     def rows(self, name: str) -> list[dict[str, Any]]:
         """Rows of a table; empty if the file lacks the table."""
@@ -108,7 +103,7 @@ class _Tables:
         found = []
         for table in ("lane", "lane_connector"):
             for name, row in self._read(table):
-                with self._leaving_out("lanes", name):
+                with self.left_out.damaged("lanes left out because they cannot be read", name):
                     found.append(self._lane(table, row))
         return found
 
@@ -150,11 +145,13 @@ class _Tables:
         found = []
         for name, row in self._read("drivable_area"):
             for i, token in enumerate(row.get("polygon_tokens", ())):
-                with self._leaving_out("areas", f"{name}_{i}"):
+                with self.left_out.damaged(
+                    "areas left out because they cannot be read", f"{name}_{i}"
+                ):
                     found.append(Area(f"{row['token']}_{i}", "drivable", self._ring(token)))
         for table, kind in AREAS.items():
             for name, row in self._read(table):
-                with self._leaving_out("areas", name):
+                with self.left_out.damaged("areas left out because they cannot be read", name):
                     found.append(Area(row["token"], kind, self._ring(row["polygon_token"])))
         return found
 
@@ -163,7 +160,7 @@ class _Tables:
         graph = joined([lane for lane in lanes if lane.junction is None] or lanes)
         found = []
         for name, row in self._read("stop_line"):
-            with self._leaving_out("stop lines", name):
+            with self.left_out.damaged("stop lines left out because they cannot be read", name):
                 ring = self._ring(row["polygon_token"])
                 middle = ring.mean(axis=0)
                 _, _, axes = np.linalg.svd((ring - middle)[:, :2], full_matrices=False)
@@ -184,12 +181,12 @@ class _Tables:
         lines = {line.stop_line_id: line for line in stop_lines}
         waits: dict[str, str] = {}
         for name, row in self._read("stop_line"):
-            with self._leaving_out("stop lines", name):
+            with self.left_out.damaged("stop lines left out because they cannot be read", name):
                 if row["token"] in lines:
                     waits |= dict.fromkeys(row.get("traffic_light_tokens", ()), row["token"])
         found = []
         for name, row in self._read("traffic_light"):
-            with self._leaving_out("signals", name):
+            with self.left_out.damaged("signals left out because they cannot be read", name):
                 pose, stop = row["pose"], waits.get(row["token"])
                 x, y, z = (float(pose[axis]) for axis in ("tx", "ty", "tz"))
                 ruled = lines[stop].lanes if stop else ()

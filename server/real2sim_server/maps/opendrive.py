@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ET
-from collections import defaultdict
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,12 +14,11 @@ import numpy as np
 from real2sim_proto.lanes import AreaKind, SignalKind
 
 from ..geometry import Float
+from ..scene.errors import LeftOut
 from ..scene.lane import TRAVELLED, Area, Lane, Road, RoadLane, Signal, StopLine
 from ..scene.lane_graph import LaneGraph
 from .opendrive_roads import SPEED_UNITS, OpenDriveRoad, SectionLane, read_road
 from .reader import (
-    LeavingOut,
-    LeftOut,
     MapError,
     check_rest,
     damage_named,
@@ -143,8 +141,8 @@ def _through(
             continue
         leaves = _facing_end(roads[incoming], roads[crossing], contact, name)
         for link in connection.findall("laneLink"):
-            told = left_out["lane links of junctions left out because they cannot be read"]
-            with LeavingOut(told, f"{connection.get('id', '')} of {name}"):
+            kind = "lane links of junctions left out because they cannot be read"
+            with left_out.damaged(kind, f"{connection.get('id', '')} of {name}"):
                 a, b = (integer(link, n) for n in ("from", "to"))
                 yield _end_of(roads[incoming], leaves, a), _end_of(roads[crossing], contact, b)
 
@@ -193,11 +191,11 @@ def read_signals(
             declared[element.get("id", "")] = element
             placed.append((road_id, element, False))
         placed += [(road_id, e, True) for e in road.element.findall("signals/signalReference")]
-    damaged = left_out["signals left out because they cannot be read"]
+    damaged = "signals left out because they cannot be read"
     for road_id, element, _ in placed:
         if element.get("type", "") in STOP_LINE_TYPES:
             name = f"{road_id}/{element.get('id', '')}"
-            with LeavingOut(damaged, name):
+            with left_out.damaged(damaged, name):
                 line = _stop_line(name, element, roads[road_id], lines[road_id])
                 if stop_lines.setdefault(name, line) is not line:
                     left_out["signals left out because their id is there twice"].append(name)
@@ -210,7 +208,7 @@ def read_signals(
             continue
         signal_id = own.get("id", "")
         name = f"{signal_id} on road {road_id}"
-        with LeavingOut(damaged, name):
+        with left_out.damaged(damaged, name):
             lanes = _ruled(element, roads[road_id], lines[road_id])
             spans = _spans(element)
             numbers = {0, *(n for section in roads[road_id].sections for n in section.lanes)}
@@ -295,7 +293,7 @@ def _signal(
     kind = _kind(own)
     value = None
     if kind == "speed_limit":
-        with LeavingOut(left_out["speed limit signs without their limit"], own.get("id", "")):
+        with left_out.damaged("speed limit signs without their limit", own.get("id", "")):
             value = _limit(own, left_out)
     return Signal(
         own.get("id", ""),
@@ -377,7 +375,7 @@ def read_crossings(
             if kind is None:
                 continue
             name = f"{road_id}/{element.get('id', '')}"
-            with LeavingOut(left_out["crosswalks and parking spaces left out"], name):
+            with left_out.damaged("crosswalks and parking spaces left out", name):
                 if name in found:
                     raise MapError("its id is there twice")
                 outline = _outline(element, lines[road_id])
@@ -447,7 +445,7 @@ class _Build:
 
     @classmethod
     def of(cls, root: ET.Element, file: str) -> _Build:
-        left_out: LeftOut = defaultdict(list)
+        left_out = LeftOut()
         _check_version(root, file, left_out)
         roads: dict[str, OpenDriveRoad] = {}
         lines: dict[str, Road] = {}
@@ -457,7 +455,7 @@ class _Build:
             if road_id in roads:
                 left_out["roads left out because their id is there twice"].append(road_id)
                 continue
-            with LeavingOut(left_out["roads left out because they cannot be read"], road_id):
+            with left_out.damaged("roads left out because they cannot be read", road_id):
                 road = read_road(element, left_out)
                 lines[road_id], roads[road_id] = _line(road), road
         if not given:
@@ -474,9 +472,7 @@ class _Build:
                     if not is_kept(lane):
                         self.left_out["lanes left out because they have no width"].append(key)
                         continue
-                    with LeavingOut(
-                        self.left_out["lanes left out because they cannot be read"], key
-                    ):
+                    with self.left_out.damaged("lanes left out because they cannot be read", key):
                         found[key] = self._lane(road, i, lane)
         if not found:
             told = "; ".join(notes_of(self.left_out))
@@ -655,7 +651,7 @@ def _geo_reference(root: ET.Element, left_out: LeftOut) -> str:
     offset = root.find("header/offset")
     if offset is None:
         return text
-    with LeavingOut(left_out["offsets of the header that cannot be read"], "<offset>"):
+    with left_out.damaged("offsets of the header that cannot be read", "<offset>"):
         x, y, z, heading = (number(offset, n, 0.0) for n in ("x", "y", "z", "hdg"))
         return f"{text} offset x={x} y={y} z={z} hdg={heading}".strip()
     return text

@@ -14,7 +14,8 @@ from scipy.special import fresnel
 from real2sim_proto.lanes import LaneKind
 
 from ..geometry import Float
-from .reader import LeavingOut, LeftOut, MapError, integer, number
+from ..scene.errors import LeftOut
+from .reader import MapError, integer, number
 
 # --- Plan view -----------------------------------------------------------------------------------
 
@@ -452,7 +453,7 @@ def _leave_out_damage(element: ET.Element, road_id: str, left_out: LeftOut) -> N
             the missing one.
     """
     for kind in element.findall("type"):
-        if _is_damaged(left_out["types of roads that cannot be read"], road_id, kind, "s"):
+        if _is_damaged(kind, "s", left_out, "types of roads that cannot be read", road_id):
             element.remove(kind)
     for i, section in enumerate(element.findall("lanes/laneSection")):
         damaged = _damaged_lanes(section, f"{road_id}.{i}", left_out)
@@ -466,13 +467,13 @@ def _leave_out_damage(element: ET.Element, road_id: str, left_out: LeftOut) -> N
 
 def _damaged_lanes(section: ET.Element, name: str, left_out: LeftOut) -> list[ET.Element]:
     """Lanes that cannot be read or placed, without their other damaged parts."""
-    told = left_out["lanes left out because they cannot be read"]
+    unread = "lanes left out because they cannot be read"
     damaged: list[ET.Element] = []
     placed: dict[int, ET.Element] = {}
     complete = True
     for lane in section.findall("*/lane"):
         number_known = False
-        with LeavingOut(told, f"{name}.{lane.get('id', '')}"):
+        with left_out.damaged(unread, f"{name}.{lane.get('id', '')}"):
             n = integer(lane, "id")
             number_known = True
             if n in placed:
@@ -495,7 +496,7 @@ def _damaged_lanes(section: ET.Element, name: str, left_out: LeftOut) -> list[ET
                 damaged.append(lane)
                 continue
             is_known = False
-            with LeavingOut(told, own):
+            with left_out.damaged(unread, own):
                 for records in (lane.findall("width"), lane.findall("border")):
                     _lateral(records, start="sOffset")
                 _leave_out_parts(lane, own, left_out)
@@ -515,13 +516,15 @@ def _leave_out_parts(lane: ET.Element, name: str, left_out: LeftOut) -> None:
     ):
         parent = lane.find("link") if path.startswith("link/") else lane
         for part in lane.findall(path):
-            told = left_out["links, marks and speeds of lanes that cannot be read"]
-            if _is_damaged(told, name, part, attribute) and parent is not None:
+            kind = "links, marks and speeds of lanes that cannot be read"
+            if _is_damaged(part, attribute, left_out, kind, name) and parent is not None:
                 parent.remove(part)
 
 
-def _is_damaged(told: list[str], name: str, element: ET.Element, attribute: str) -> bool:
-    with LeavingOut(told, name):
+def _is_damaged(
+    element: ET.Element, attribute: str, left_out: LeftOut, kind: str, name: str
+) -> bool:
+    with left_out.damaged(kind, name):
         if attribute == "id":
             integer(element, attribute)
         else:
@@ -733,7 +736,7 @@ def _speed_limit(lane: ET.Element, at: _Stretch) -> float | None:
         before = [(s, e) for s, e in records if s <= middle]
         if before:
             name = f"{at.name}.{lane.get('id')}"
-            with LeavingOut(at.left_out["lanes without their speed limit"], name):
+            with at.left_out.damaged("lanes without their speed limit", name):
                 return _speed(max(before, key=lambda record: record[0])[1])
             return None
     return None

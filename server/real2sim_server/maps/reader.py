@@ -5,10 +5,9 @@ from __future__ import annotations
 import json
 import math
 import xml.etree.ElementTree as ET
-from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sized
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
@@ -16,7 +15,8 @@ import numpy as np
 
 from .._files import read_text, read_xml
 from ..geometry import Float
-from ..scene import Lane, LaneGraph, SceneError
+from ..scene import Lane, LaneGraph
+from ..scene.errors import FileError, LeftOut
 
 
 class MapReader(Protocol):
@@ -46,7 +46,7 @@ class MapReader(Protocol):
 # --- Errors --------------------------------------------------------------------------------------
 
 
-class MapError(ValueError):
+class MapError(FileError):
     """A map that cannot be read or does not fit; the message names the file, the problem and the
     expected content.
     """
@@ -69,35 +69,6 @@ def damage_named(where: str) -> Iterator[None]:
 
 
 # --- Parts that are left out ----------------------------------------------------------------------
-
-LeftOut = dict[str, list[str]]
-"""Names of parts by what a reader did with them, such as "roads left out because ..."."""
-
-DAMAGE = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError, SceneError)
-"""What reading a damaged part raises."""
-
-
-@dataclass
-class LeavingOut:
-    """Leaves out what the block reads if it is damaged; its name and the reason go to ``told``."""
-
-    told: list[str]
-    name: str
-
-    def __enter__(self) -> None:
-        """Begin to read the part."""
-
-    def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> bool:
-        """Whether the part is left out."""
-        if not isinstance(error, DAMAGE):
-            return False
-        reason = str(error) if isinstance(error, MapError | SceneError) else _reason(error)
-        self.told.append(f"{self.name}: {reason}")
-        return True
-
-
-def _reason(error: BaseException) -> str:
-    return f"lacks {error}" if isinstance(error, KeyError) else f"{type(error).__name__}, {error}"
 
 
 def check_rest(
@@ -369,7 +340,7 @@ def joined(lanes: Iterable[Lane], left_out: LeftOut | None = None, **parts: Any)
     Raises:
         SceneError: as :meth:`LaneGraph.of`.
     """
-    told: LeftOut = defaultdict(list) if left_out is None else left_out
+    told = LeftOut() if left_out is None else left_out
     there = unique(lanes, "lane_id", told["lanes left out because their id is there twice"])
     absent = told["links to lanes that are not in the file"]
     kept = []

@@ -21,8 +21,8 @@ import pytest
 from pyarrow import feather
 
 from real2sim_server.logs import DrivingLog, open_log
-from real2sim_server.logs.readers.common import LeftOut
 from real2sim_server.logs.readers.waymo_v1 import ProtoMessage, _split, list_records, read_record
+from real2sim_server.scene.errors import LeftOut
 from real2sim_server.synthetic import SyntheticConfig, generate_log
 
 from .conftest import _layout, write_layout

@@ -11,13 +11,13 @@ from scipy.spatial import cKDTree
 
 from real2sim_server.geometry import apply_transform, invert_transform
 from real2sim_server.logs import DrivingLog, LogError, ObjectTrack, open_log
-from real2sim_server.logs.readers.common import LeftOut
 from real2sim_server.logs.readers.waymo_v1 import (
     ProtoMessage,
     list_records,
     masked_crc32c,
     read_record,
 )
+from real2sim_server.scene.errors import LeftOut
 from real2sim_server.synthetic import SyntheticLog
 
 

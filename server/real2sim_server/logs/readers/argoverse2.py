@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 
 from ...geometry import Float, invert_transform, transform_from
 from ...scene import CameraRig, Trajectory
+from ...scene.errors import LeftOut
 from ..driving_log import DrivingLog, LidarSweep, LogError, LoggedMap, ObjectTrack
 from .common import (
     FrameBox,
-    LeftOut,
     Lens,
     TimedImages,
     build_tracks,
@@ -100,7 +100,7 @@ class Argoverse2Reader:
             if found is not None:
                 images[name] = found
             else:
-                left_out.add("cameras", f"camera {name!r}: has no images")
+                left_out["cameras"].append(f"camera {name!r}: has no images")
         frames = covered_frames(city, sweeps.times_us, left_out, str(where))
         times_us = sweeps.times_us[frames]
         matched = match_images(
@@ -157,7 +157,7 @@ def _recordings(folder: Path, suffix: str, left_out: LeftOut) -> TimedImages | N
         if path.stem.isdecimal() and len(path.stem) <= MAX_DIGITS:
             files[int(path.stem) // 1000] = path
         else:
-            left_out.add("files", f"{path}: its name should be a time stamp [ns]")
+            left_out["files"].append(f"{path}: its name should be a time stamp [ns]")
     times_us = sorted(files)
     if not times_us:
         return None
@@ -184,8 +184,8 @@ def _transforms(
     norms = np.linalg.norm(quaternions, axis=1)
     bad = ~np.isfinite(positions).all(axis=1) | ~(np.abs(norms - 1) < 1e-2)
     for row in np.flatnonzero(bad):
-        left_out.add(
-            kind, f"{path} row {row}: the pose is not finite, or its quaternion not of unit length"
+        left_out[kind].append(
+            f"{path} row {row}: the pose is not finite, or its quaternion not of unit length"
         )
     quaternions[bad], positions[bad] = (1, 0, 0, 0), 0
     return transform_from(positions, quaternions), np.flatnonzero(~bad)
@@ -221,7 +221,7 @@ def _read_calibration(folder: Path, left_out: LeftOut) -> tuple[dict[str, Lens],
             lens.camera(name, mounts[name])
             lenses[name] = lens
     if "up_lidar" not in mounts:
-        left_out.add("LiDARs", f"{poses_path}: has no pose of 'up_lidar'")
+        left_out["LiDARs"].append(f"{poses_path}: has no pose of 'up_lidar'")
     return lenses, mounts
 
 
@@ -238,14 +238,14 @@ def _read_tracks(
     in_vehicle = _shift(AXLE_HEIGHT) @ poses
     inside = [t for t in set(times_us) if sweeps_us[0] < t < sweeps_us[-1]]
     for t_us in sorted(set(inside) - set(sweeps_us.tolist())):
-        left_out.add("frames", f"{path}: has boxes at {t_us} us, when there is no sweep")
+        left_out["frames"].append(f"{path}: has boxes at {t_us} us, when there is no sweep")
     vehicle = {t: ego.transform(t) for t in set(times_us) if ego.covers(t)}
     sizes = np.stack([table[n] for n in SIZE], axis=1).tolist()
     boxes = []
     for row in good.tolist():
         time_us, where = times_us[row], f"{path} row {row}"
         if time_us not in vehicle:
-            left_out.add("boxes", f"{where}: there is no ego pose at {time_us} us")
+            left_out["boxes"].append(f"{where}: there is no ego pose at {time_us} us")
             continue
         category = str(table["category"][row]).lower()
         length, width, height = sizes[row]

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 from ...geometry import Float, are_rigid, invert_transform
 from ...scene import BrownConrady, Camera, SceneError, Shutter, Trajectory
 from ...scene.camera import GLOBAL, Optics
+from ...scene.errors import LeftOut
 from ..driving_log import DrivingLog, LogError, ObjectTrack
 
 
@@ -47,29 +47,6 @@ def upright_pose(centre: Iterable[float], heading: float) -> Float:
     pose[:2, :2] = [[cos, -sin], [sin, cos]]
     pose[:3, 3] = list(centre)
     return pose
-
-
-class LeftOut:
-    """Collects the records of a log that its reader does not use, by kind."""
-
-    def __init__(self) -> None:
-        self._told: dict[str, list[str]] = defaultdict(list)
-
-    def add(self, kind: str, sentence: str) -> None:
-        """Leave out one record; the sentence names the file, the place and the reason."""
-        self._told[kind].append(sentence)
-
-    @contextmanager
-    def damaged(self, kind: str) -> Iterator[None]:
-        """Leave out the record that the block reads if it raises LogError or SceneError."""
-        try:
-            yield
-        except (LogError, SceneError) as error:
-            self.add(kind, str(error))
-
-    def told(self) -> dict[str, tuple[str, ...]]:
-        """The sentences by kind, as ``DrivingLog.left_out``."""
-        return {kind: tuple(sentences) for kind, sentences in self._told.items()}
 
 
 def build_tracks(
@@ -104,7 +81,7 @@ def build_tracks(
         for other, count in categories.items():
             if other != category:
                 told = f"{key!r}: is a {category} in most frames, and a {other} in {count}"
-                left_out.add("categories", told)
+                left_out["categories"].append(told)
         object_id = f"{category}_{key if own_numbers else numbers[category]}"
         numbers[category] += 1
         keys[object_id] = key
@@ -142,7 +119,7 @@ def covered_frames(
             f"{where}: {span}, but the frames go from {times_us.min()} to {times_us.max()} us"
         )
     for t_us in times_us[~covered]:
-        left_out.add("frames", f"{where}: {span}, but not the frame at {t_us} us")
+        left_out["frames"].append(f"{where}: {span}, but not the frame at {t_us} us")
     return np.flatnonzero(covered)
 
 
@@ -201,10 +178,10 @@ def match_images(
         times_us[name] = np.where(found, camera.times_us[index], frame_times_us)
         for i in np.flatnonzero(~found).tolist():
             absent.add((name, i))
-            left_out.add(
-                "images" if name.islower() else "sweeps",
+            kind = "images" if name.islower() else "sweeps"
+            left_out[kind].append(
                 f"{where}: {name!r} recorded nothing within {tolerance_us * 1e-6:g} s of the frame "
-                f"at {frame_times_us[i]} us",
+                f"at {frame_times_us[i]} us"
             )
     return MatchedImages(files, times_us, frozenset(absent))
 

@@ -18,19 +18,17 @@ from numpy.typing import NDArray
 
 from ...geometry import Float, invert_transform
 from ...scene import CameraRig, Trajectory
+from ...scene.errors import LeftOut
 from ..driving_log import DrivingLog, LidarSweep, LogError, ObjectTrack
-from ..images import common_size
-from .common import FrameBox, LeftOut, build_tracks
+from .common import FrameBox, build_tracks
 from .files import (
     ImageFiles,
-    check_rigid,
     count_rows,
-    parse_numbers,
     read_json,
-    read_lines,
+    read_rigid,
     read_rows,
 )
-from .waymo_common import EGO_SIZE, LICENCE, TRUCK_LENGTH, waymo_camera
+from .waymo_common import EGO_SIZE, LICENCE, TRUCK_LENGTH, folder_cameras, folder_images
 
 PERIOD_US = 100_000
 COLUMNS = 14
@@ -68,7 +66,12 @@ class DrivestudioReader:
         times_us = np.array(frames, dtype=np.int64) * PERIOD_US
         to_first = invert_transform(poses[frames[0]])
         in_log = {frame: to_first @ pose for frame, pose in poses.items()}
-        rig, images = _read_cameras(path, frames, left_out)
+        cameras = folder_cameras(path, np.eye(4), left_out)
+        rig = CameraRig(tuple(c.lens.camera(c.name, c.T_vehicle_camera) for c in cameras))
+        images = ImageFiles(
+            {c.name: folder_images(path, c, frames, 3) for c in cameras},
+            {c.name: c.lens for c in cameras},
+        )
         info = path / "instances" / "instances_info.json"
         tracks, keys = _read_tracks(info, to_first, in_log, left_out)
         return DrivingLog(
@@ -96,46 +99,10 @@ def _read_poses(folder: Path, left_out: LeftOut) -> dict[int, Float]:
     poses = {}
     for frame in range(max(numbers, default=-1) + 1):
         with left_out.damaged("frames"):
-            poses[frame] = _matrix(folder / f"{frame:03d}.txt")
+            poses[frame] = read_rigid(folder / f"{frame:03d}.txt")
     if not poses:
         raise LogError(f"{folder}: holds no usable pose %03d.txt")
     return poses
-
-
-def _matrix(path: Path) -> Float:
-    numbers = _numbers(path)
-    if numbers.size != 16:
-        raise LogError(f"{path}: expected 16 numbers, found {numbers.size}")
-    return check_rigid(numbers.reshape(4, 4), str(path))
-
-
-def _numbers(path: Path) -> Float:
-    return parse_numbers(" ".join(read_lines(path)).split(), str(path))
-
-
-def _read_cameras(path: Path, frames: list[int], left_out: LeftOut) -> tuple[CameraRig, ImageFiles]:
-    cameras, files, lenses = [], {}, {}
-    for intrinsics in sorted((path / "intrinsics").glob("*.txt")):
-        with left_out.damaged("cameras"):
-            if not intrinsics.stem.isdecimal():
-                raise LogError(f"{intrinsics}: its name should be a camera's number")
-            index = int(intrinsics.stem)
-            found = sorted((path / "images").glob(f"*_{index}.*"))
-            if not found:
-                raise LogError(f"{path / 'images'}: camera {index} has no images")
-            camera = waymo_camera(
-                index + 1,
-                size=common_size(found),
-                intrinsic=_numbers(intrinsics).tolist(),
-                extrinsic=_matrix(path / "extrinsics" / intrinsics.name),
-                shutter=0,
-                where=str(intrinsics),
-            )
-            cameras.append(camera.lens.camera(camera.name, camera.T_vehicle_camera))
-            names = [f"{frame:03d}_{index}{found[0].suffix}" for frame in frames]
-            files[camera.name] = [path / "images" / name for name in names]
-            lenses[camera.name] = camera.lens
-    return CameraRig(tuple(cameras)), ImageFiles(files, lenses)
 
 
 def _read_tracks(
@@ -153,7 +120,9 @@ def _read_tracks(
                 if box.time_us // PERIOD_US in poses:
                     boxes.append(replace(box, T_world_object=to_first @ box.T_world_object))
                 else:
-                    left_out.add("boxes", f"{box.where}: there is no usable frame of this number")
+                    left_out["boxes"].append(
+                        f"{box.where}: there is no usable frame of this number"
+                    )
     return build_tracks(boxes, left_out)
 
 

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from ..._files import read_text
 from ...geometry import Float, is_rotation
-from ...scene import Trajectory
+from ...scene.errors import LeftOut
 from ..driving_log import LogError
 from ..images import check_image_file, read_image
-from .common import LeftOut, Lens
+from .common import Lens
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +79,7 @@ class Tables:
                     by_token[token] = _Row(item, self.path(name))
                     continue
                 reason = "has no token" if token not in by_token else f"is a second {token!r}"
-                left_out.add("rows", f"{self.path(name)}: row {number} {reason}")
+                left_out["rows"].append(f"{self.path(name)}: row {number} {reason}")
             self._rows[name] = list(by_token.values())
             self._by_token[name] = by_token
 
@@ -161,7 +161,7 @@ class ParquetFile:
             if column.null_count:
                 good &= np.asarray(compute.is_valid(column))
         for row in np.flatnonzero(~good):
-            left_out.add("rows", f"{self.path} row {row}: has an empty cell")
+            left_out["rows"].append(f"{self.path} row {row}: has an empty cell")
         return good
 
     def numbers(self, name: str) -> NDArray[Any]:
@@ -291,7 +291,7 @@ def read_feather(
             empty |= np.asarray(compute.is_null(column))
     if left_out is not None:
         for row in np.flatnonzero(empty):
-            left_out.add(kind, f"{path} row {row}: has an empty cell")
+            left_out[kind].append(f"{path} row {row}: has an empty cell")
     found = {}
     for name in columns:
         with _broken_named(f"{path}: column {name!r}"):
@@ -386,6 +386,19 @@ def parse_numbers(words: list[str], where: str) -> Float:
     return values
 
 
+def read_numbers(path: Path) -> Float:
+    """All numbers of a text file. Raises LogError."""
+    return parse_numbers(" ".join(read_lines(path)).split(), str(path))
+
+
+def read_rigid(path: Path) -> Float:
+    """A rigid transform [4, 4] in a text file. Raises LogError."""
+    numbers = read_numbers(path)
+    if numbers.size != 16:
+        raise LogError(f"{path}: expected 16 numbers, found {numbers.size}")
+    return check_rigid(numbers.reshape(4, 4), str(path))
+
+
 def read_number_table(path: Path, *, columns: int, what: str, left_out: LeftOut) -> Float:
     """Rows [N, columns] float64 of a table, separated by white space or commas.
 
@@ -435,16 +448,3 @@ def check_frame_times(times_us: NDArray[np.int64], where: str) -> NDArray[np.int
             f"and frame {i + 1} at {times_us[i + 1]} us"
         )
     return times_us
-
-
-def check_ego_covers(ego: Trajectory, times_us: NDArray[np.int64], where: str) -> None:
-    """Check that ego poses cover all frames.
-
-    Raises:
-        LogError: otherwise.
-    """
-    if not (ego.covers(int(times_us[0])) and ego.covers(int(times_us[-1]))):
-        raise LogError(
-            f"{where}: ego poses cover [{ego.start_us}, {ego.end_us}] us, but the frames go from "
-            f"{times_us[0]} to {times_us[-1]} us"
-        )

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from ...geometry import Float
 from ...scene import Trajectory
+from ...scene.errors import LeftOut
 from ..driving_log import DrivingLog, LogError, ObjectTrack
-from .common import FrameBox, LeftOut, build_tracks, select_sequence, upright_pose
+from .common import FrameBox, build_tracks, select_sequence, upright_pose
 from .files import read_lines, read_number_table
 from .kitti_tracking import (
     KITTI_EGO_SIZE,

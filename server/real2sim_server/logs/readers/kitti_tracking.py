@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 
 from ...geometry import Float, apply_transform, are_rigid, invert_transform
 from ...scene import Camera, CameraRig, Trajectory
+from ...scene.errors import LeftOut
 from ..driving_log import NO_SWEEP, DrivingLog, LidarSweep, LogError, ObjectTrack
 from ..images import IMAGE_SUFFIXES, check_image_file, common_size, read_image
-from .common import FrameBox, LeftOut, build_tracks, compensate_sweep, select_sequence
+from .common import FrameBox, build_tracks, compensate_sweep, select_sequence
 from .files import (
     check_rigid,
     count_rows,
@@ -162,7 +163,9 @@ def read_poses(path: Path, left_out: LeftOut) -> Float:
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3] = rows.reshape(-1, 3, 4)
     for i in np.flatnonzero(~are_rigid(poses) & np.isfinite(rows).all(axis=1)):
-        left_out.add("lines", f"{path} line {i + 1}: its left 3x3 block is not a rotation matrix")
+        left_out["lines"].append(
+            f"{path} line {i + 1}: its left 3x3 block is not a rotation matrix"
+        )
         poses[i] = np.nan
     return poses
 
@@ -238,10 +241,10 @@ def usable_frames(
     kept: list[int] = []
     for frame, (t_us, pose) in enumerate(zip(times_us, poses, strict=True)):
         if not (np.isfinite(t_us) and np.isfinite(pose).all()):
-            left_out.add("frames", f"{where}: frame {frame} has no usable pose or time")
+            left_out["frames"].append(f"{where}: frame {frame} has no usable pose or time")
         elif kept and t_us <= times_us[kept[-1]]:
             told = f"frame {frame} is at {t_us:.0f} us, not after frame {kept[-1]}"
-            left_out.add("frames", f"{where}: {told}")
+            left_out["frames"].append(f"{where}: {told}")
         else:
             kept.append(frame)
     if not kept:
@@ -480,7 +483,7 @@ def _labels(
             return read_labels(path, frame_count, left_out), folder
     if (root / "label_02").is_dir():
         missing = root / "label_02" / f"{sequence}.txt"
-        left_out.add("files", f"{missing}: no such file; it holds the boxes")
+        left_out["files"].append(f"{missing}: no such file; it holds the boxes")
     return [], None
 
 
@@ -494,7 +497,7 @@ def _tracks(
     kept, boxes = set(frames.tolist()), []
     for label in labels:
         if label.frame not in kept:
-            left_out.add("boxes", f"{label.where}: its frame is left out")
+            left_out["boxes"].append(f"{label.where}: its frame is left out")
             continue
         boxes.append(
             FrameBox(

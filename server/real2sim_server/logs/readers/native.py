@@ -22,10 +22,11 @@ from ..._files import read_text
 from ..._npy import read_entries, read_headers, read_npy
 from ...scene import Camera, CameraRig, LaneGraph, SceneError, Trajectory
 from ...scene.camera import Optics
+from ...scene.errors import LeftOut
 from ...scene.io.document import OpticsPart, lane_document, read_lanes
 from ..driving_log import NO_SWEEP, DrivingLog, LidarSweep, LogError, ObjectTrack
 from ..images import IMAGE_SUFFIXES, check_image_file, read_image, write_image
-from .common import LeftOut, covered_frames
+from .common import covered_frames
 from .files import check_frame_times
 
 FORMAT = "real2sim-log"
@@ -157,7 +158,7 @@ class _JsonSection:
             if isinstance(item, dict):
                 found.append(_JsonSection(item, where))
             else:
-                left_out.add(key, f"{where} must be an object, found {item!r}")
+                left_out[key].append(f"{where} must be an object, found {item!r}")
         return found
 
     def numbers(
@@ -237,9 +238,9 @@ def _read_trajectory(section: _JsonSection, left_out: LeftOut, kind: str) -> Tra
     for i, t_us in enumerate(times_us.tolist()):
         where = f"{section.where}, pose {i} at {t_us} us"
         if not (np.isfinite(positions[i]).all() and abs(norms[i] - 1) < QUATERNION_TOLERANCE):
-            left_out.add(kind, f"{where}: is not finite, or its quaternion not of unit length")
+            left_out[kind].append(f"{where}: is not finite, or its quaternion not of unit length")
         elif kept and t_us <= times_us[kept[-1]]:
-            left_out.add(kind, f"{where}: does not come after the pose before")
+            left_out[kind].append(f"{where}: does not come after the pose before")
         else:
             kept.append(i)
     try:

@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 
 from ...geometry import Float, apply_transform, invert_transform, transform_from
 from ...scene import CameraRig, Trajectory
+from ...scene.errors import LeftOut
 from ..driving_log import NO_SWEEP, DrivingLog, LidarSweep, LogError, LoggedMap, ObjectTrack
 from .common import (
     FrameBox,
-    LeftOut,
     Lens,
     TimedImages,
     build_tracks,
@@ -163,7 +163,7 @@ def _samples(tables: Tables, scene: str, left_out: LeftOut) -> dict[str, int]:
 def _time_us(tables: Tables, table: str, row: Mapping[str, Any]) -> int:
     value = row["timestamp"]
     if not isinstance(value, int | float) or not abs(value) < MAX_TIME_US:
-        raise LogError(f"{tables.path(table)}: {row['token']!r}: timestamp {value!r} is no time")
+        raise LogError(f"{tables.path(table)}: {row['token']!r}: timestamp {value!r} is not a time")
     return int(value)
 
 
@@ -233,7 +233,9 @@ def _lens(tables: Tables, row: Mapping[str, Any], mount: Mapping[str, Any]) -> L
         k = np.array(mount["camera_intrinsic"], dtype=np.float64)
         width, height = int(row["width"]), int(row["height"])
     except (TypeError, ValueError) as error:
-        raise LogError(f"{where}: its intrinsics or image size are no numbers ({error})") from error
+        raise LogError(
+            f"{where}: its intrinsics or image size are not numbers ({error})"
+        ) from error
     if k.shape != (3, 3) or not np.isfinite(k).all() or min(k[0, 0], k[1, 1]) <= 0:
         raise LogError(f"{where}: camera_intrinsic must be a 3x3 matrix, not {k.tolist()}")
     if min(width, height) < 1:
@@ -248,7 +250,7 @@ def _pose(tables: Tables, table: str, row: Mapping[str, Any]) -> Float:
         position = np.array(row["translation"], dtype=np.float64)
         quaternion = np.array(row["rotation"], dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise LogError(f"{where}: the pose holds no numbers ({error})") from error
+        raise LogError(f"{where}: the pose is not numeric ({error})") from error
     length = np.linalg.norm(quaternion)
     if position.shape != (3,) or quaternion.shape != (4,) or not abs(length - 1) < 1e-2:
         raise LogError(f"{where}: the pose is not rigid")

@@ -23,12 +23,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..._confined import ConfinedError, Limits, run_confined
-from ...geometry import Float
+from ...geometry import invert_transform
 from ...scene.camera import T_VEHICLE_OPTICAL
+from ...scene.errors import LeftOut
 from ..driving_log import DrivingLog, LidarSweep, LogError
-from ..images import common_size
-from .common import LeftOut
-from .files import ImageFiles, check_rigid, parse_numbers, read_json, read_lines
+from .files import ImageFiles, parse_numbers, read_json, read_lines, read_rigid
 from .waymo_common import (
     CAMERA_NAMES,
     MAX_TIME_S,
@@ -37,8 +36,9 @@ from .waymo_common import (
     WaymoFrame,
     WaymoImage,
     build_waymo_log,
+    folder_cameras,
+    folder_images,
     usable_frames,
-    waymo_camera,
 )
 
 # --- Pickled arrays ------------------------------------------------------------------------------
@@ -306,7 +306,7 @@ class StreetGaussiansReader:
         if sequence is not None:
             raise LogError(f"{path}: holds one drive; it has no sequence {sequence!r}")
         times, left_out = _Times(path / "timestamps.json"), LeftOut()
-        cameras = _read_cameras(path, left_out)
+        cameras = folder_cameras(path, invert_transform(T_VEHICLE_OPTICAL), left_out)
         boxes = _read_boxes(path / "track" / "track_info.txt", left_out)
         numbers = _frame_numbers(path / "ego_pose")
         frames: list[WaymoFrame] = []
@@ -318,10 +318,10 @@ class StreetGaussiansReader:
                 by_start.setdefault(frame.start_us, number)
         for number, lost in boxes.items():
             for box in lost:
-                left_out.add("boxes", f"{box.where}: there is no usable frame {number}")
+                left_out["boxes"].append(f"{box.where}: there is no usable frame {number}")
         frames = usable_frames(frames, left_out, str(path))
         numbers = [by_start[frame.start_us] for frame in frames]
-        files = {c.name: _image_files(path, c.number - 1, numbers) for c in cameras}
+        files = {c.name: folder_images(path, c, numbers, 6) for c in cameras}
         images = ImageFiles(files, {c.name: c.lens for c in cameras})
         points = path / "pointcloud.npz"
         return build_waymo_log(
@@ -365,52 +365,11 @@ class _Times:
         return round(value * 1e6)
 
 
-def _read_cameras(path: Path, left_out: LeftOut) -> list[WaymoCamera]:
-    """Cameras with a calibration and images, by number."""
-    cameras = []
-    for intrinsics in (path / "intrinsics").glob("*.txt"):
-        with left_out.damaged("cameras"):
-            if not intrinsics.stem.isdecimal():
-                raise LogError(f"{intrinsics}: its name should be a camera's number")
-            index = int(intrinsics.stem)
-            images = sorted((path / "images").glob(f"*_{index}.*"))
-            if not images:
-                raise LogError(f"{path / 'images'}: camera {index} has no images")
-            extrinsics = path / "extrinsics" / intrinsics.name
-            camera = waymo_camera(
-                index + 1,
-                size=common_size(images),
-                intrinsic=_numbers_of(intrinsics).tolist(),
-                extrinsic=_matrix(extrinsics) @ np.linalg.inv(T_VEHICLE_OPTICAL),
-                shutter=0,
-                where=str(intrinsics),
-            )
-            cameras.append(camera)
-    return sorted(cameras, key=lambda camera: camera.number)
-
-
-def _numbers_of(path: Path) -> Float:
-    return parse_numbers(" ".join(read_lines(path)).split(), str(path))
-
-
-def _matrix(path: Path) -> Float:
-    numbers = _numbers_of(path)
-    if numbers.size != 16:
-        raise LogError(f"{path}: expected 16 numbers, found {numbers.size}")
-    return check_rigid(numbers.reshape(4, 4), str(path))
-
-
-def _image_files(path: Path, camera: int, numbers: Sequence[int]) -> list[Path]:
-    """One file per frame; it need not exist."""
-    suffix = next((path / "images").glob(f"*_{camera}.*")).suffix
-    return [path / "images" / f"{number:06d}_{camera}{suffix}" for number in numbers]
-
-
 def _read_frame(
     path: Path, frame: int, times: _Times, cameras: Sequence[WaymoCamera], left_out: LeftOut
 ) -> WaymoFrame:
     start_us = times.time_us("FRAME", frame)
-    pose = _matrix(path / "ego_pose" / f"{frame:06d}.txt")
+    pose = read_rigid(path / "ego_pose" / f"{frame:06d}.txt")
     assert start_us is not None
     images = {}
     for camera in cameras:
@@ -420,7 +379,7 @@ def _read_frame(
             time_us = times.time_us(sensor, frame) or start_us
         with left_out.damaged("poses"):
             file = path / "ego_pose" / f"{frame:06d}_{camera.number - 1}.txt"
-            own = _matrix(file) if file.exists() else pose
+            own = read_rigid(file) if file.exists() else pose
         images[camera.number] = WaymoImage(time_us, own, 0.0)
     return WaymoFrame(start_us, pose, images)
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,9 +19,11 @@ from numpy.typing import NDArray
 from ...geometry import Float, apply_transform, invert_transform
 from ...scene import Camera, CameraRig, Shutter, Trajectory
 from ...scene.camera import DIRECTIONS, GLOBAL, MAX_READOUT_US, T_VEHICLE_OPTICAL
+from ...scene.errors import LeftOut
 from ..driving_log import DrivingLog, FrameSource, LidarSweep, LogError
-from .common import FrameBox, LeftOut, Lens, build_tracks, upright_pose
-from .files import check_frame_times, check_rigid
+from ..images import common_size
+from .common import FrameBox, Lens, build_tracks, upright_pose
+from .files import check_frame_times, check_rigid, read_numbers, read_rigid
 
 # --- Range images --------------------------------------------------------------------------------
 
@@ -252,6 +255,46 @@ def waymo_camera(
     return WaymoCamera(number, lens, pose, SHUTTERS.get(shutter, "unknown"))
 
 
+def folder_cameras(path: Path, T_waymo_given: Float, left_out: LeftOut) -> list[WaymoCamera]:
+    """Cameras of a folder with ``intrinsics/``, ``extrinsics/`` and ``images/*_<index>.*``.
+
+    Args:
+        path: the folder.
+        T_waymo_given: [4, 4] from the axes of its extrinsics to those of Waymo's cameras, applied
+            from the right.
+        left_out: collects cameras without images or with a damaged calibration.
+    """
+    cameras = []
+    for intrinsics in (path / "intrinsics").glob("*.txt"):
+        with left_out.damaged("cameras"):
+            if not intrinsics.stem.isdecimal():
+                raise LogError(f"{intrinsics}: its name should be a camera's number")
+            index = int(intrinsics.stem)
+            images = sorted((path / "images").glob(f"*_{index}.*"))
+            if not images:
+                raise LogError(f"{path / 'images'}: camera {index} has no images")
+            cameras.append(
+                waymo_camera(
+                    index + 1,
+                    size=common_size(images),
+                    intrinsic=read_numbers(intrinsics).tolist(),
+                    extrinsic=read_rigid(path / "extrinsics" / intrinsics.name) @ T_waymo_given,
+                    shutter=0,
+                    where=str(intrinsics),
+                )
+            )
+    return sorted(cameras, key=lambda camera: camera.number)
+
+
+def folder_images(
+    path: Path, camera: WaymoCamera, frames: Sequence[int], digits: int
+) -> list[Path]:
+    """The file of each frame in ``images/``; it need not exist."""
+    index = camera.number - 1
+    suffix = next((path / "images").glob(f"*_{index}.*")).suffix
+    return [path / "images" / f"{frame:0{digits}d}_{index}{suffix}" for frame in frames]
+
+
 @dataclass(frozen=True, eq=False)
 class WaymoImage:
     """Time and vehicle pose of an image.
@@ -334,7 +377,7 @@ def usable_frames(frames: Sequence[WaymoFrame], left_out: LeftOut, where: str) -
             by_time[frame.start_us] = replace(frame, images=images)
         if len(by_time) == kept:
             for box in frame.boxes:
-                left_out.add("boxes", f"{box.where}: its frame is left out")
+                left_out["boxes"].append(f"{box.where}: its frame is left out")
     if not by_time:
         raise LogError(f"{where}: has no frame with a pose")
     return [by_time[t] for t in sorted(by_time)]
@@ -371,7 +414,7 @@ def build_waymo_log(
                 _camera(camera, frames)
                 used.append(camera)
         else:
-            left_out.add("cameras", f"{where}: camera {camera.name!r} has no images")
+            left_out["cameras"].append(f"{where}: camera {camera.name!r} has no images")
     absent = frozenset(
         (camera.name, i)
         for i, frame in enumerate(frames)
@@ -382,12 +425,12 @@ def build_waymo_log(
         for camera in used:
             if (camera.name, i) in absent:
                 told = f"{camera.name!r} has no usable image in the frame of {frame.start_us} us"
-                left_out.add("images", f"{where}: camera {told}")
+                left_out["images"].append(f"{where}: camera {told}")
     has_lidar = any(f.has_sweep for f in frames)
     no_sweep = frozenset(i for i, f in enumerate(frames) if has_lidar and not f.has_sweep)
     for i in sorted(no_sweep):
         told = f"the frame of {frames[i].start_us} us has no sweep of the TOP laser"
-        left_out.add("sweeps", f"{where}: {told}")
+        left_out["sweeps"].append(f"{where}: {told}")
     tracks, keys = build_tracks(_boxes(frames, to_first, left_out), left_out)
     return DrivingLog(
         name=name,

@@ -20,9 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...geometry import Float
+from ...scene.errors import LeftOut
 from ..driving_log import DrivingLog, LidarSweep, LogError
 from ..images import check_encoded_image, decode_image
-from .common import LeftOut, select_sequence
+from .common import select_sequence
 from .waymo_common import (
     MAX_TIME_S,
     TOP,
@@ -78,7 +79,7 @@ def list_records(path: Path, left_out: LeftOut) -> list[Record]:
                 except LogError as error:
                     if not records:
                         raise
-                    left_out.add("ends of files", f"{error}; the rest is not read")
+                    left_out["ends of files"].append(f"{error}; the rest is not read")
                     break
                 records.append(record)
                 position = record.offset + record.length + 4

@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...geometry import Float
+from ...scene.errors import LeftOut
 from ..driving_log import DrivingLog, LidarSweep, LogError
 from ..images import check_encoded_image, decode_image
-from .common import LeftOut, select_sequence
+from .common import select_sequence
 from .files import ParquetFile
 from .waymo_common import (
     MAX_TIME_S,
@@ -243,10 +244,10 @@ def _read_frames(
     good = np.flatnonzero(file.complete([TIME], left_out)).tolist()
     posed = {int(times[row]) for row in good}
     for time in sorted({t for _, t in images} - posed):
-        left_out.add("frames", f"{file.path}: has no pose for the frame of {time} us")
+        left_out["frames"].append(f"{file.path}: has no pose for the frame of {time} us")
     for time in sorted(set(boxes) - posed):
         for box in boxes[time]:
-            left_out.add("boxes", f"{box.where}: its frame of {time} us has no pose")
+            left_out["boxes"].append(f"{box.where}: its frame of {time} us has no pose")
     by_time: dict[int, dict[int, WaymoImage]] = defaultdict(dict)
     for (number, time), (_, image) in images.items():
         by_time[time][number] = image
@@ -289,7 +290,7 @@ def _open_lidar(files: _SegmentFiles, left_out: LeftOut) -> _Lidar | None:
     lasers = _read_lasers(files.open("lidar_calibration"), left_out)
     for number in sorted({number for number, _ in rows} - set(lasers)):
         told = f"has no usable laser {number}"
-        left_out.add("LiDARs", f"{files.path('lidar_calibration')}: {told}")
+        left_out["LiDARs"].append(f"{files.path('lidar_calibration')}: {told}")
     rows = {key: row for key, row in rows.items() if key[0] in lasers}
     return _Lidar(ranges, poses, lasers, rows, _rows(poses, left_out) if poses is not None else {})
 
@@ -300,7 +301,9 @@ def _rows(file: ParquetFile, left_out: LeftOut) -> dict[tuple[int, int], int]:
     for row in np.flatnonzero(file.complete([LASER, TIME], left_out)).tolist():
         key = int(numbers[row]), int(times[row])
         if key in found:
-            left_out.add("rows", f"{file.path} row {row}: laser {key[0]} is twice at {key[1]} us")
+            left_out["rows"].append(
+                f"{file.path} row {row}: laser {key[0]} is twice at {key[1]} us"
+            )
         else:
             found[key] = row
     return found

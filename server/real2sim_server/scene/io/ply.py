@@ -151,7 +151,7 @@ def read_ply_elements(path: Path, notes: list[str] | None = None) -> dict[str, N
         if element.has_lists and element.count:
             sentence = f"ply element {element.name!r} has list properties"
             if "vertex" not in [known.name for known in elements[:index]]:
-                raise BundleError(f"{path}: {sentence}, the vertices of a splat file none")
+                raise BundleError(f"{path}: {sentence}; those of a splat file are plain numbers")
             note(path, notes, sentence, "it and the elements after it are left out")
             elements = elements[:index]
             break
