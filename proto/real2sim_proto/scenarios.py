@@ -77,7 +77,9 @@ class OperationBatch(Model):
 class EditWarning(Reply):
     """A warning for the user; the operation took effect."""
 
-    code: str = one_of(Literal["overlap", "off_ground", "outside_map", "sideways"])
+    code: str = one_of(
+        Literal["overlap", "off_ground", "outside_map", "sideways", "unseen_sides", "unseen_ground"]
+    )
     object_id: str
     message: str
 

@@ -49,7 +49,9 @@ JsonFile = Annotated[
 SceneBundle = Annotated[
     Path, typer.Argument(help="Scene bundle, packed scene (.r2s.zip) or demo_street.")
 ]
-LogFolder = Annotated[Path, typer.Argument(help="Folder of a driving log.")]
+DrivingLogPath = Annotated[
+    Path, typer.Argument(help="Driving log: a folder, or the file of a drive that is one file.")
+]
 LogFormat = Annotated[
     str | None, typer.Option("--format", help="Format of the log; default: detected.")
 ]
@@ -140,10 +142,10 @@ def opened_log(
     *,
     provenance: Mapping[str, Any] | None = None,
 ) -> DrivingLog:
-    """The log in a folder without what cannot be used, which is printed.
+    """A log without what cannot be used, which is printed.
 
     Args:
-        path: the folder.
+        path: see :func:`~.logs.open_log`.
         log_format: see :func:`~.logs.open_log`.
         sequence: see :func:`~.logs.open_log`.
         provenance: of a scene made from a part of the log, which is selected.

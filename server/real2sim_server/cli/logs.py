@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ..console import CommandError, console, print_figures, progress, refuse_existing, write_json
-from .common import JsonFile, LogFolder, LogFormat, SequenceName, Strict, command, opened_log
+from .common import DrivingLogPath, JsonFile, LogFormat, SequenceName, Strict, command, opened_log
 
 if TYPE_CHECKING:
     from ..logs import ObjectTrack
@@ -73,7 +73,7 @@ def synth(
 @command("log-info")
 def log_info(
     *,
-    log: LogFolder,
+    log: DrivingLogPath,
     out: Annotated[
         Path | None, typer.Option("--out", help="Folder for pictures with boxes and LiDAR.")
     ] = None,
@@ -118,7 +118,7 @@ def log_info(
 @command("track")
 def track(
     *,
-    log: Annotated[Path, typer.Argument(help="Folder of a driving log with LiDAR.")],
+    log: DrivingLogPath,
     out: Annotated[Path, typer.Option("--out", help="Output folder of the log with boxes.")],
     keep: Annotated[
         bool, typer.Option("--keep", help="Keep the log's own boxes and add missing ones.")
@@ -137,7 +137,7 @@ def track(
     sequence: SequenceName = None,
     json: JsonFile = None,
 ) -> None:
-    """Detect and track moving objects in a log without boxes."""
+    """Detect and track moving objects in the LiDAR of a log without boxes."""
     from ..logs import inspect_log
     from ..logs.readers.native import write_native_log
     from ..logs.tracking import TrackingOptions, merge_tracks, track_moving_objects
@@ -148,6 +148,8 @@ def track(
     start = time.perf_counter()
     with progress("tracking") as report:
         found = track_moving_objects(opened, options, on_progress=report)
+    if not found and not any(len(opened.lidar(f).points) for f in range(opened.frame_count)):
+        raise CommandError(f"{log} has no LiDAR; track finds objects in LiDAR only")
     if not found:
         raise CommandError(
             f"nothing that moves was found in the LiDAR of {log}; a lower --min-distance or "

@@ -305,6 +305,7 @@ def _examples(
         scene_images,
     )
     from ..scene.io import DEMO_SCENE, open_scene
+    from ..scene.io.packed import PACKED_SUFFIX
 
     if all(is_export(source) for source in sources):
         shape = exported_shape(sources[0], camera)
@@ -313,7 +314,8 @@ def _examples(
     if len(sources) > 1:
         raise CommandError("several sources must all be data sets that export-dataset has written")
     (source,) = sources
-    if (source / "scene.json").is_file() or source.is_file() or str(source) == DEMO_SCENE:
+    packed = source.name.endswith(PACKED_SUFFIX)
+    if (source / "scene.json").is_file() or packed or str(source) == DEMO_SCENE:
         scene = open_scene(source)
         ego, shape = scene.ego, _policy_shape(scene.rig, camera)
         images = scene_images(scene, shape, shifted=shifted, seed=seed)

@@ -18,10 +18,10 @@ from ..console import (
     write_json,
 )
 from .common import (
+    DrivingLogPath,
     JsonFile,
     LogCameras,
     LogEvery,
-    LogFolder,
     LogFormat,
     LogFrames,
     Overwrite,
@@ -54,7 +54,7 @@ if TYPE_CHECKING:
 @command("reconstruct")
 def reconstruct(
     *,
-    log: LogFolder,
+    log: DrivingLogPath,
     out: Annotated[Path, typer.Option("--out", help="Scene bundle to write.")],
     iterations: Annotated[
         int, typer.Option(min=0, help="Training steps; 0 builds from LiDAR without training.")
@@ -159,7 +159,7 @@ def _training_bar(report: Callable[..., None]) -> Callable[[TrainingProgress], N
 def evaluate(
     *,
     scene: SceneBundle,
-    log: Annotated[Path, typer.Argument(help="Folder of the scene's driving log.")],
+    log: DrivingLogPath,
     frames: Annotated[
         str, typer.Option(help="Frames: held-out, all, or numbers such as 3,7,11.")
     ] = "held-out",
@@ -305,7 +305,7 @@ class FitFiles:
 
     Attributes:
         scene: bundle.
-        log: folder of the driving log.
+        log: the scene's driving log.
         out: bundle to write; None overwrites the scene.
         log_format, sequence: format and sequence of the log, if they cannot be detected.
         json: file for the figures.
@@ -343,7 +343,7 @@ def fit_scene(
 def fit_lidar(
     *,
     scene: SceneBundle,
-    log: Annotated[Path, typer.Argument(help="Folder of the scene's driving log.")],
+    log: DrivingLogPath,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Output bundle; default: the scene itself.")
     ] = None,
@@ -386,7 +386,7 @@ def fit_lidar(
 def fit_uncertainty(
     *,
     scene: SceneBundle,
-    log: Annotated[Path, typer.Argument(help="Folder of the scene's driving log.")],
+    log: DrivingLogPath,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Output bundle; default: the scene itself.")
     ] = None,

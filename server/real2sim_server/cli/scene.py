@@ -511,7 +511,7 @@ def _lanes_of(
 
     if source == "log":
         if log is None:
-            raise CommandError("--from log needs the driving log: --log FOLDER")
+            raise CommandError("--from log needs the driving log: --log LOG")
         return lanes_from_log(opened_log(log, *reading, provenance=scene.provenance)), {}
     graph = read_map(source)
     if as_it_is:

@@ -24,6 +24,7 @@ from ..geometry import (
 from ..render.types import Instance
 from ..scene import UNSEEN, GaussianCloud, Ground, Scene
 from ..scene.cloud import SH_C0
+from ..scene.coverage import LOW, MARGIN
 from .state import ObjectState, ScenarioState
 
 Colour = tuple[float, float, float]
@@ -36,14 +37,8 @@ tracks of stationary objects vary by some decimetres.
 AWAY = 0.5
 """An object at least this far from its parked position uncovers the ground there [m]."""
 
-MARGIN = 0.25
-"""Colours reach this far beyond a box [m]."""
-
 RIM = 1.2
 """Width of the ground around the box that represents the ground under it [m]."""
-
-LOW = 0.25
-"""The ground's Gaussians are less than this above or below the box's bottom [m]."""
 
 MIN_POINTS = 6
 NEIGHBOURS = 48

@@ -17,6 +17,7 @@ from real2sim_proto.scenarios import EditWarning
 from ..geometry import box_corners, first_overlap
 from ..scene import Ground, SceneError, Trajectory
 from . import lifecycle, motion
+from .appearance import AWAY
 from .motion import AppliedOperation, apply_operation
 from .state import EditError, ObjectState, ScenarioState
 from .tracks import Float, sample
@@ -37,6 +38,12 @@ SLIP, SLIP_STEPS, MOVING = np.radians(20), 5, 1.0
 this many samples more than in the recording. Slower objects [m/s] count as stationary.
 """
 
+LEAST_SEEN = 0.6
+"""Surfaces of which images saw a smaller share are reported."""
+
+TURNED = np.radians(30)
+"""An object turned by more than this against the recorded drive shows other sides [rad]."""
+
 NAMED_OVERLAPS = 5
 
 REMEMBERED_RANGES = 4
@@ -54,10 +61,12 @@ def validate_edit(state: ScenarioState, touched: Sequence[str]) -> Iterator[Edit
 
     Args:
         state: state after the edit.
-        touched: ids that the edit named or created; deleted ones are skipped.
+        touched: ids that the edit named or created; of deleted ones, only the ground is checked.
     """
-    subjects = [state.objects[i] for i in touched if not state.objects[i].deleted]
-    for subject in subjects:
+    for subject in (state.objects[i] for i in touched):
+        yield from _uncovered_ground(subject, state)
+        if subject.deleted:
+            continue
         times = _sample_times(subject.trajectory.start_us, subject.trajectory.end_us)
         transforms, _ = _sampled(subject.trajectory, int(times[0]), int(times[-1]))
         yield from _overlaps(subject, state, times, transforms)
@@ -65,6 +74,7 @@ def validate_edit(state: ScenarioState, touched: Sequence[str]) -> Iterator[Edit
         yield from _off_ground(subject, recorded, transforms, state.ground)
         yield from _outside_map(subject, state.extent, transforms)
         yield from _sideways(subject, recorded, times, transforms)
+        yield from _unseen_sides(subject, recorded, state, times, transforms)
 
 
 def _sampled(trajectory: Trajectory, start_us: int, end_us: int) -> _Samples:
@@ -163,10 +173,13 @@ def _recorded_clearance(recorded: ObjectState, ground: Ground) -> float:
 
 
 def _clearance(transforms: Float, subject: ObjectState, ground: Ground) -> Float:
-    count = 1 if subject.standing else MAX_GROUND_SAMPLES
-    sparse = transforms[:: -(-len(transforms) // count)]
+    sparse = _sparse(transforms, 1 if subject.standing else MAX_GROUND_SAMPLES)
     lowest: Float = box_corners(sparse, subject.scaled_size)[..., 2].min(axis=-1)
     return lowest - ground.height_at(sparse[:, :2, 3])
+
+
+def _sparse(transforms: Float, count: int) -> Float:
+    return transforms[:: -(-len(transforms) // count)]
 
 
 def _outside_map(subject: ObjectState, extent: Float, transforms: Float) -> Iterator[EditWarning]:
@@ -210,6 +223,90 @@ def _slips(times: NDArray[np.int64], transforms: Float) -> Float:
     across = np.abs(way[:, 0] * ahead[:, 1] - way[:, 1] * ahead[:, 0])
     slips: Float = np.where(length > MOVING * np.diff(times) * 1e-6, np.arctan2(across, along), 0.0)
     return slips
+
+
+def _unseen_sides(
+    subject: ObjectState,
+    recorded: ObjectState | None,
+    state: ScenarioState,
+    times: NDArray[np.int64],
+    own: Float,
+) -> Iterator[EditWarning]:
+    coverage = state.coverage
+    if (
+        coverage is None
+        or recorded is None
+        or subject.category in lifecycle.PEOPLE
+        or not subject.edited
+    ):
+        return
+    track = recorded.trajectory
+    theirs, _ = _sampled(track, track.start_us, track.end_us)
+    usual = _drive_seen_from(recorded, theirs, track.start_us, track.end_us, coverage.ego)
+    azimuth = _drive_seen_from(subject, own, int(times[0]), int(times[-1]), coverage.ego)
+    if usual is None or azimuth is None or abs(_wrapped(azimuth - usual)) <= TURNED:
+        return
+    share = coverage.of_side(subject.source_id, azimuth)
+    if share < LEAST_SEEN:
+        yield EditWarning(
+            code="unseen_sides",
+            object_id=subject.object_id,
+            message=f"{100 * share:.0f} % of the sides of {subject.object_id!r} that face the "
+            "recorded drive were ever seen; the colours of the rest are guessed. Turn its recorded "
+            "side to the drive, or replace it with an asset",
+        )
+
+
+def _drive_seen_from(
+    subject: ObjectState, transforms: Float, start_us: int, end_us: int, ego: Trajectory
+) -> float | None:
+    """Azimuth of the nearest point of the recorded drive in the object's frame [rad].
+
+    For a moving object, of the vehicle when it is nearest; None if they never exist together.
+    """
+    if subject.standing:
+        transforms, there = transforms[:1], ego.positions
+    else:
+        vehicle, covered = _sampled(ego, start_us, end_us)
+        transforms, there = transforms[covered], vehicle[covered, :3, 3]
+    if not len(there):
+        return None
+    ways = there[:, :2] - transforms[:, :2, 3]
+    nearest = int(np.linalg.norm(ways, axis=1).argmin())
+    pose = transforms[min(nearest, len(transforms) - 1)]
+    # Scaling an axis turns its normals the other way.
+    x, y = ways[nearest] @ pose[:2, :2] / subject.scale[:2]
+    return float(np.arctan2(y, x))
+
+
+def _wrapped(angle: float) -> float:
+    return float((angle + np.pi) % (2 * np.pi) - np.pi)
+
+
+def _uncovered_ground(subject: ObjectState, state: ScenarioState) -> Iterator[EditWarning]:
+    coverage, recorded = state.coverage, state.recorded.get(subject.object_id)
+    if coverage is None or recorded is None or recorded.category in lifecycle.PEOPLE:
+        return
+    track = recorded.trajectory
+    theirs, _ = _sampled(track, track.start_us, track.end_us)
+    if not subject.deleted:
+        own, covered = _sampled(subject.trajectory, track.start_us, track.end_us)
+        apart = np.linalg.norm(own[:, :2, 3] - theirs[:, :2, 3], axis=1)
+        if (covered & (apart <= AWAY)).all():
+            return
+    footprints = [theirs[0]]
+    for pose in _sparse(theirs, MAX_GROUND_SAMPLES):
+        if np.linalg.norm(pose[:2, 3] - footprints[-1][:2, 3]) > AWAY:
+            footprints.append(pose)
+    share = coverage.of_ground(subject.object_id, footprints, recorded.size)
+    if share < LEAST_SEEN:
+        yield EditWarning(
+            code="unseen_ground",
+            object_id=subject.object_id,
+            message=f"{100 * share:.0f} % of the ground that {subject.object_id!r} leaves was ever "
+            "seen; the colours of the rest are guessed. Put another object there, or keep cameras "
+            "away from it",
+        )
 
 
 OPERATION_MODULES = (lifecycle, motion)

@@ -17,7 +17,7 @@ from real2sim_proto.episode import AgentDriver
 from real2sim_proto.operations import AddCollider, EraseRegion, SetGait, SetPhysics, SetVelocity
 from real2sim_proto.storyboard import Storyboard
 
-from ..scene import Figure, GaussianCloud, Ground, Scene, Trajectory
+from ..scene import Coverage, Figure, GaussianCloud, Ground, Scene, Trajectory
 from .tracks import PackedTracks
 
 
@@ -66,6 +66,8 @@ class SceneSource(Protocol):
     def ego(self) -> Trajectory: ...  # noqa: D102
     @property
     def ground(self) -> Ground: ...  # noqa: D102
+    @property
+    def coverage(self) -> Coverage | None: ...  # noqa: D102
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,6 +147,7 @@ class ScenarioState:
         storyboard: default storyboard of episodes, or None.
         recorded: objects of the scene, by id.
         ground: ground of the scene.
+        coverage: what images saw of the scene; None if unknown.
         assets: the asset library, or None.
         extent: [2, 2] lowest and highest x, y that the ego or an object reaches in the scene [m].
     """
@@ -156,6 +159,7 @@ class ScenarioState:
     extent: NDArray[np.float64] = field(repr=False)
     clock: tuple[int, int]
     ground: Ground = field(repr=False)
+    coverage: Coverage | None = field(default=None, repr=False)
     assets: AssetLookup | None = field(default=None, repr=False)
     regions: Mapping[str, EraseRegion] = field(default_factory=dict)
     colliders: Mapping[str, AddCollider] = field(default_factory=dict)
@@ -189,6 +193,7 @@ class ScenarioState:
             extent=np.stack([reached.min(axis=0), reached.max(axis=0)]),
             clock=(scene.ego.start_us, scene.ego.end_us),
             ground=scene.ground,
+            coverage=scene.coverage,
             assets=assets,
         )
 

@@ -257,6 +257,8 @@ MANY_OFF = 0.3
 """Minimum fraction of misaligned vehicles for a hint; a few may drive backwards."""
 DRIVEN_STEP_M = 0.3
 """Minimum distance of two poses for a direction of motion."""
+LEAST_DRIVEN_M = 1.0
+"""Minimum length of a drive for depths from images alone [m]."""
 MIN_UP = 0.3
 """Minimum z component of an axis that should point up."""
 CAMERA_REACH = np.array([15.0, 4.0]), (-0.5, 6.0)
@@ -296,7 +298,7 @@ def questions_to(log: DrivingLog, sweeps: Mapping[int, LidarSweep]) -> list[str]
     if not sweeps:
         return found
     if not any(len(s.points) for s in sweeps.values()):
-        return [*found, "there is no LiDAR: depths come from what images have in common"]
+        return [*found, *_images_alone(log)]
     if not log.tracks:
         found.append("there are no boxes: moving objects have to be tracked first")
     found += [*_intensity(sweeps), *_ground(sweeps), *_boxes(log, sweeps), *_standing(log, sweeps)]
@@ -315,6 +317,20 @@ def ego_steps(log: DrivingLog) -> Float:
     """Distance of the ego from frame to frame, [F - 1] [m]."""
     positions = np.array([log.ego.pose(int(t))[0] for t in log.frame_times_us])
     return np.asarray(np.linalg.norm(np.diff(positions, axis=0), axis=1))
+
+
+def _images_alone(log: DrivingLog) -> list[str]:
+    """What a log without LiDAR can be used for."""
+    driven = float(ego_steps(log).sum())
+    found = [
+        "there is no LiDAR: reconstruct takes depths from features that images have in common; "
+        "track and fit-lidar need LiDAR"
+    ]
+    if driven < LEAST_DRIVEN_M:
+        found.append(
+            f"the ego drives {driven:.1f} m: without LiDAR, depths need images from several places"
+        )
+    return found
 
 
 def _odd_times(log: DrivingLog) -> list[str]:

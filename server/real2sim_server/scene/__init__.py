@@ -6,6 +6,7 @@ This package is independent of simulation time and of HTTP.
 from .asset import Asset
 from .camera import Camera, CameraMotion, CameraRig, Shutter
 from .cloud import UNSEEN, GaussianCloud, TimeColour
+from .coverage import Coverage
 from .errors import (
     BundleError,
     BundleTooLargeError,
@@ -36,6 +37,7 @@ __all__ = [
     "Camera",
     "CameraMotion",
     "CameraRig",
+    "Coverage",
     "Detection",
     "FTheta",
     "Figure",

@@ -16,6 +16,7 @@ from torch import Tensor
 from ..geometry import Float, box_corners
 from .camera import CameraRig
 from .cloud import GaussianCloud, TimeColour
+from .coverage import Coverage
 from .errors import SceneError, UnknownObjectError
 from .figure import Figure
 from .ground import Ground, of_bundle
@@ -333,6 +334,14 @@ class Scene:
     def has_uncertainties(self) -> bool:
         """Whether uncertainties are known."""
         return self.background.uncertainties is not None
+
+    @cached_property
+    def coverage(self) -> Coverage | None:
+        """What images saw of the background and the objects without a figure; None if unknown."""
+        if not self.has_uncertainties:
+            return None
+        solid = {k: o.cloud for k, o in self.objects.items() if o.figure is None}
+        return Coverage(self.background, solid, self.ego)
 
     @property
     def nbytes(self) -> int:

@@ -95,6 +95,29 @@ def test_every_command_with_a_json_option_is_tested():
     assert with_figures - CLIENT == set(COMMANDS) | {"search"}
 
 
+TAKE_LOGS = {
+    "reconstruct": "{gone} --out {out}",
+    "log-info": "{gone}",
+    "track": "{gone} --out {out}",
+    "evaluate": "{tiny} {gone}",
+    "fit-lidar": "{tiny} {gone} --out {out}",
+    "fit-uncertainty": "{tiny} {gone} --out {out}",
+    "render": "{tiny} --out {out}.png --width 64 --log {gone}",
+    "ground": "{tiny} --log {gone}",
+    "map": "{tiny} --from log --log {gone} --out {out}.json",
+    "train-policy": "{gone} --out {out}.safetensors",
+}
+
+
+@pytest.mark.parametrize("command", TAKE_LOGS)
+def test_every_command_says_the_same_of_a_log_that_is_not_there(made, command, tmp_path):
+    words = made[0] | {"gone": tmp_path / "gone.tfrecord", "out": tmp_path / "out"}
+    given = TAKE_LOGS[command].format(**words).split()
+    done = CliRunner().invoke(build_app(), [command, *given], env={"COLUMNS": "400"})
+    assert done.exit_code == 1
+    assert f"{words['gone']}: no such file or folder; give the folder of a log" in done.output
+
+
 SLOW = {"fit-lidar", "track", "train-policy"}
 
 

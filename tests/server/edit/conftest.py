@@ -61,7 +61,7 @@ def summary() -> SimpleNamespace:
     ]
     ego = on_the_ground(drive(0.0, 0.0, speed=10.0))
     ground = fit_scene_ground(GaussianCloud.empty(), ego, objects)
-    return SimpleNamespace(objects=objects, ego=ego, ground=ground)
+    return SimpleNamespace(objects=objects, ego=ego, ground=ground, coverage=None)
 
 
 @pytest.fixture(scope="session")

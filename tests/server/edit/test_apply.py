@@ -273,7 +273,7 @@ def test_objects_cannot_leave_the_range_of_the_protocol(state):
 
 def test_a_scene_and_its_summary_give_the_same_state(summary, state):
     by_id = {o.object_id: o for o in summary.objects}
-    as_mapping = type(summary)(objects=by_id, ego=summary.ego, ground=summary.ground)
+    as_mapping = type(summary)(**vars(summary) | {"objects": by_id})
 
     assert list(ScenarioState.of(as_mapping).objects) == list(state.objects)
     assert [o.instance_id for o in state.objects.values()] == [1, 2, 3, 4]

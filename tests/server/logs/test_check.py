@@ -89,6 +89,12 @@ def told(folder: Path, *options: str) -> Result:
     return CliRunner().invoke(build_app(), ["log-info", str(folder), *options])
 
 
+def test_the_report_takes_a_drive_that_is_one_file(written_waymo_v1: Path) -> None:
+    done = told(written_waymo_v1 / "tiny.tfrecord")
+    assert done.exit_code == 0
+    assert "frames    3 in 0.2 s" in done.output
+
+
 @pytest.fixture(scope="session")
 def written_long(tiny_log: SyntheticLog, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Eight frames of the same street. A report reads frames 0, 4 and 7."""

@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from real2sim_server.logs import DrivingLog, LidarSweep, inspect_log, open_log
+from real2sim_server.logs import DrivingLog, LidarSweep, inspect_log, log_of_frames, open_log
 from real2sim_server.logs.drawing import draw_frame
+from real2sim_server.logs.driving_log import NO_SWEEP
 from real2sim_server.logs.images import read_image
 from real2sim_server.scene import Trajectory
 from real2sim_server.synthetic import SyntheticLog
@@ -104,6 +105,25 @@ def test_missing_parts_are_named(tiny_log: SyntheticLog, written_argoverse2: Pat
     report = inspect_log(open_log(written_argoverse2))
     assert not report.questions
     assert report.left_out == {"cameras": ("camera 'ring_rear_left': has no images",)}
+
+
+@dataclasses.dataclass(frozen=True)
+class _OnlyImages:
+    source: object
+
+    def image(self, camera: str, frame: int) -> np.ndarray:
+        return self.source.image(camera, frame)  # type: ignore[attr-defined,no-any-return]
+
+    def lidar(self, frame: int) -> LidarSweep:
+        return NO_SWEEP
+
+
+def test_a_log_without_lidar_is_told_what_works(tiny_log: SyntheticLog) -> None:
+    log = dataclasses.replace(tiny_log, source=_OnlyImages(tiny_log.source))
+    (question,) = inspect_log(log).questions
+    assert "reconstruct takes depths from features that images have in common" in question
+    one = log_of_frames(log, [0])
+    assert any("the ego drives 0.0 m: without LiDAR" in q for q in inspect_log(one).questions)
 
 
 def test_drawings_are_written(tiny_log: SyntheticLog, tmp_path: Path) -> None:

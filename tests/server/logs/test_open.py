@@ -5,12 +5,35 @@ from pathlib import Path
 import pytest
 
 from real2sim_server.logs import LogError, open_log
+from real2sim_server.logs.readers import READERS, LogReader
 from real2sim_server.logs.readers.native import NativeReader
 
 
-def test_missing_folder_is_named(tmp_path: Path) -> None:
-    with pytest.raises(LogError, match="nowhere: no such folder"):
+def test_missing_path_is_named(tmp_path: Path) -> None:
+    with pytest.raises(LogError, match=r"(?s)nowhere: no such file or folder; .*native: log\.json"):
         open_log(tmp_path / "nowhere")
+
+
+def test_a_drive_that_is_one_file_opens_like_its_folder(written_waymo_v1: Path) -> None:
+    log = open_log(written_waymo_v1 / "tiny.tfrecord")
+    assert log.provenance == open_log(written_waymo_v1).provenance
+    assert log.frame_count == 3
+
+
+def test_the_sequence_of_a_file_is_its_name(written_waymo_v1: Path) -> None:
+    file = written_waymo_v1 / "tiny.tfrecord"
+    assert open_log(file, sequence="tiny").frame_count == 3
+    with pytest.raises(LogError, match=r"tiny\.tfrecord: holds .*'tiny'.*there is no 'other'"):
+        open_log(file, sequence="other")
+
+
+@pytest.mark.parametrize("reader", READERS, ids=lambda reader: reader.name)
+def test_no_reader_takes_a_file_of_another_kind(reader: LogReader, tmp_path: Path) -> None:
+    file = tmp_path / "notes.txt"
+    file.write_text("no log")
+    assert not reader.recognises(file)
+    with pytest.raises(LogError, match=r"notes\.txt"):
+        open_log(file, format=reader.name)
 
 
 def test_empty_folder_lists_all_formats(tmp_path: Path) -> None:

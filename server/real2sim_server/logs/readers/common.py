@@ -391,14 +391,14 @@ class LogReader(Protocol):
 
     Attributes:
         name: the format's name, for ``open_log(format=...)``.
-        expects: one line for users with the required content of the folder.
+        expects: one line for users with the required content of the folder, or the file.
     """
 
     name: str
     expects: str
 
     def recognises(self, path: Path) -> bool:
-        """Whether the folder has this layout; cheap, and never raises."""
+        """Whether the folder or file has this layout; cheap, and never raises."""
         ...
 
     def read(self, path: Path, *, sequence: str | None = None) -> DrivingLog:

@@ -280,11 +280,11 @@ class WaymoV1Reader:
     expects = "<segment>.tfrecord (Waymo perception, edition 1)"
 
     def recognises(self, path: Path) -> bool:
-        """Whether there is a TFRecord file."""
-        return any(path.glob(f"*{SUFFIX}"))
+        """Whether this is a TFRecord file, or a folder with at least one."""
+        return bool(_segments(path))
 
     def read(self, path: Path, *, sequence: str | None = None) -> DrivingLog:
-        """The file ``<sequence>.tfrecord``; the only one by default.
+        """The file ``path``, or ``<sequence>.tfrecord`` in it; the only one by default.
 
         Images are undistorted when they are read, all lasers and both returns are merged. Every
         record is read once to check it and to list poses and boxes. Times: :mod:`.waymo_common`.
@@ -292,8 +292,9 @@ class WaymoV1Reader:
         Raises:
             LogError: see :class:`LogReader`.
         """
-        name = select_sequence(path, sorted(p.stem for p in path.glob(f"*{SUFFIX}")), sequence)
-        file = path / f"{name}{SUFFIX}"
+        files = _segments(path)
+        name = select_sequence(path, sorted(files), sequence)
+        file = files[name]
         left_out = LeftOut()
         first, read = None, []
         places: dict[int, Record] = {}
@@ -333,6 +334,12 @@ class WaymoV1Reader:
             },
             left_out=left_out,
         )
+
+
+def _segments(path: Path) -> dict[str, Path]:
+    """TFRecord files by name of their segment: ``path`` itself, or those in it."""
+    files = path.glob(f"*{SUFFIX}") if path.is_dir() else [path]
+    return {p.stem: p for p in files if p.suffix == SUFFIX and p.is_file()}
 
 
 Calibrated = TypeVar("Calibrated", WaymoCamera, Laser)

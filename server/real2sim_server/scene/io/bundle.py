@@ -18,6 +18,7 @@ from ..._confined import ConfinedError, Limits, run_confined
 from ...body.gait import GaitStyle
 from ..asset import Asset
 from ..cloud import GaussianCloud, TimeColour
+from ..coverage import Coverage
 from ..errors import BundleError, BundleTooLargeError, SceneError
 from ..figure import Figure
 from ..ground import Ground, of_bundle
@@ -201,6 +202,20 @@ def load_lanes(path: str | PathLike[str], content_hash: str) -> LaneGraph | None
     document = _document_of(folder, content_hash)
     with _as_bundle_error(folder):
         return _lanes(folder, document, verify=True) if document.content.lanes else None
+
+
+def load_coverage(path: str | PathLike[str], content_hash: str) -> Coverage | None:
+    """What images saw of a scene bundle, with memory-mapped Gaussians; None without uncertainties.
+
+    Args:
+        path: folder of the bundle.
+        content_hash: expected hash of the bundle.
+
+    Raises:
+        BundleError: as :func:`load_scene`, or the hash has changed.
+    """
+    _document_of(Path(path), content_hash)
+    return load_scene(path, verify=False).coverage
 
 
 def _document_of(folder: Path, content_hash: str) -> SceneDocument:

@@ -14,11 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..camera import CameraRig
+from ..coverage import Coverage
 from ..errors import BundleError, SceneError
 from ..ground import Ground
 from ..lane_graph import LaneGraph
 from ..trajectory import Trajectory
-from .bundle import load_ground, load_lanes
+from .bundle import load_coverage, load_ground, load_lanes
 from .container import check_file, cloud_shapes, figure_shapes, read_container
 from .document import UNCERTAINTIES, AssetDocument, Bounds, SceneDocument, Vector3
 
@@ -88,6 +89,15 @@ class SceneSummary:
             BundleError: the bundle is damaged, or another one has replaced it.
         """
         return load_lanes(self.path, self.content_hash) if self.lane_count else None
+
+    @cached_property
+    def coverage(self) -> Coverage | None:
+        """What images saw of the scene, as in Scene; its files are opened on first access.
+
+        Raises:
+            BundleError: the bundle is damaged, or another one has replaced it.
+        """
+        return load_coverage(self.path, self.content_hash) if self.has_uncertainties else None
 
     @property
     def gaussian_count(self) -> int:

@@ -43,9 +43,24 @@ def test_uncertainties_round_trip(certain, tmp_path):
         assert torch.equal(read.objects[name].cloud.uncertainties, item.cloud.uncertainties)
 
 
+def test_a_summary_knows_what_images_saw(certain, tmp_path):
+    save_scene(certain, tmp_path / "a.r2s")
+    coverage = read_scene_summary(tmp_path / "a.r2s").coverage
+    for name, item in certain.objects.items():
+        for azimuth in (-2.0, 0.0, 1.0, 4.0):
+            assert coverage.of_side(name, azimuth) == pytest.approx(
+                certain.coverage.of_side(name, azimuth), nan_ok=True
+            )
+        poses = [item.trajectory.transform(item.trajectory.start_us)]
+        assert coverage.of_ground(name, poses, item.size) == pytest.approx(
+            certain.coverage.of_ground(name, poses, item.size), nan_ok=True
+        )
+
+
 def test_a_scene_without_uncertainties_has_none(scene, tmp_path):
     save_scene(scene, tmp_path / "a.r2s")
     assert not read_scene_summary(tmp_path / "a.r2s").has_uncertainties
+    assert read_scene_summary(tmp_path / "a.r2s").coverage is scene.coverage is None
     read = load_scene(tmp_path / "a.r2s")
     assert read.background.uncertainties is read.sky.uncertainties is None
 
