@@ -21,7 +21,7 @@ from ...synthetic.vehicles import SHAPES
 from ..logged_view import image_time, tracks_mask
 from .images import SEEN_WITHIN, is_seen, logged_azimuths, mean_psnr, psnr, ssim
 from .rendering import render_view, spread
-from .shifted import within_an_object
+from .shifted import MIN_OBJECT_PIXELS, within_an_object
 
 LANE_M = 3.5
 """Distance by which a vehicle is moved to its left [m]."""
@@ -92,10 +92,11 @@ class EditViewScore:
         camera, frame: camera and frame of the view.
         psnr, ssim: over the region that the edit changes [dB], [1].
         pixels: number of its pixels.
-        psnr_hidden_ground: over the ground that the edit reveals [dB]; nan without such pixels.
-        psnr_shadows: over the rest of the region without the vehicle at either place [dB].
-        psnr_unseen: over the vehicle at its new place [dB]; nan if a camera of the log saw this
-            side, and for deletions.
+        psnr_hidden_ground: over the ground that the edit reveals [dB]; nan below 50 pixels.
+        psnr_shadows: over the rest of the region without the vehicle at either place [dB]; nan
+            below 50 pixels.
+        psnr_unseen: over the vehicle at its new place [dB]; nan below 50 pixels, if a camera of
+            the log saw this side, and for deletions.
     """
 
     camera: str
@@ -270,15 +271,20 @@ def score_view(view: EditedView, camera: str, frame: int) -> EditViewScore:
     """Scores of a view within its masks."""
     rendered, after = view.rendered, view.after
     unseen = view.vehicle & (view.seen is False)
+
+    def psnr_of_part(mask: NDArray[np.bool_]) -> float:
+        enough = int(mask.sum()) >= MIN_OBJECT_PIXELS
+        return psnr(rendered, after, mask) if enough else float("nan")
+
     return EditViewScore(
         camera=camera,
         frame=frame,
         psnr=psnr(rendered, after, view.region),
         ssim=ssim(rendered, after, view.region),
         pixels=int(view.region.sum()),
-        psnr_hidden_ground=psnr(rendered, after, view.hidden_ground),
-        psnr_shadows=psnr(rendered, after, view.shadows),
-        psnr_unseen=psnr(rendered, after, unseen),
+        psnr_hidden_ground=psnr_of_part(view.hidden_ground),
+        psnr_shadows=psnr_of_part(view.shadows),
+        psnr_unseen=psnr_of_part(unseen),
     )
 
 

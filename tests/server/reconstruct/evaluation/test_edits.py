@@ -124,6 +124,15 @@ def test_the_ground_that_a_deleted_car_hid_is_scored_alone(view_of):
     assert score.psnr < 20
 
 
+def test_parts_of_few_pixels_are_not_scored(view_of):
+    view = view_of(PARKED, "delete")
+    few = np.zeros_like(view.hidden_ground)
+    few[:7, :7] = True
+    score = score_view(replace(view, hidden_ground=few), "front", FRAME)
+    assert np.isnan(score.psnr_hidden_ground)
+    assert np.isfinite(score.psnr_shadows)
+
+
 def test_a_car_ahead_turned_around_shows_a_side_that_no_camera_saw(view_of):
     assert view_of(AHEAD, "turn_35").seen is True
     around = view_of(AHEAD, "turn_180")
