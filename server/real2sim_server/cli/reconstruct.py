@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
+from rich.markup import escape
+from rich.table import Table
 
 from ..console import (
     CommandError,
@@ -43,6 +46,7 @@ if TYPE_CHECKING:
     from ..maps import LaneSource
     from ..reconstruct import InitialiseOptions
     from ..reconstruct.evaluation import Evaluation
+    from ..reconstruct.evaluation.edits import EditScore
     from ..reconstruct.evaluation.lidar import LidarScore
     from ..reconstruct.training.records import TrainingProgress
     from ..scene import Scene
@@ -173,6 +177,9 @@ def evaluate(
     around: Annotated[
         bool, typer.Option("--around", help="Also view vehicles from all sides (synthetic logs).")
     ] = False,
+    edits: Annotated[
+        bool, typer.Option("--edits", help="Also score edited vehicles (synthetic logs).")
+    ] = False,
     lidar: Annotated[
         bool, typer.Option("--lidar", help="Also simulate LiDAR sweeps and compare them.")
     ] = False,
@@ -195,6 +202,7 @@ def evaluate(
         shifts=_parse_shifts(shifts),
         backend=chosen_backend(backend, device),
         around=around,
+        edits=edits,
         lidar=lidar,
     )
     loaded = open_scene(scene)
@@ -202,6 +210,8 @@ def evaluate(
     with staged_progress() as on_progress:
         result = evaluate_scene(loaded, opened, options=options, on_progress=on_progress)
     print_figures(f"{scene.name} against {opened.name}", _table(result))
+    if result.edits is not None:
+        _print_edits(result.edits)
     if not result.frames_unseen:
         console.print(
             "the scene names no held-out frames, so these may have been used to make it",
@@ -271,6 +281,29 @@ def _table(result: Evaluation) -> dict[str, object]:
     if result.lidar is not None:
         figures |= _lidar_figures(result.lidar)
     return figures
+
+
+def _print_edits(scores: Sequence[EditScore]) -> None:
+    if not scores:
+        console.print("no compared frame shows a vehicle of the scene that could be edited")
+        return
+    table = Table(title="edited vehicles, where edits change the street", title_justify="left")
+    table.add_column("vehicle", overflow="fold")
+    table.add_column("edit", overflow="fold")
+    for name in ("PSNR [dB]", "SSIM", "pixels", "views", "ground", "shadows", "unseen"):
+        table.add_column(escape(name), justify="right")
+    for score in scores:
+        ratios = (score.psnr_hidden_ground, score.psnr_shadows, score.psnr_unseen)
+        table.add_row(
+            escape(f"{score.object_id} ({score.vehicle})"),
+            score.edit,
+            f"{score.psnr:.2f}",
+            f"{score.ssim:.3f}",
+            str(score.pixels),
+            str(len(score.views)),
+            *("–" if math.isnan(ratio) else f"{ratio:.2f}" for ratio in ratios),
+        )
+    console.print(table)
 
 
 def _lidar_figures(score: LidarScore) -> dict[str, object]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..geometry import Float, apply_transform, invert_transform
 from ..logs.driving_log import DrivingLog, LidarSweep, ObjectTrack
 from ..logs.readers.native import write_native_log
-from ..scene import Camera, CameraMotion, CameraRig, Lidar
+from ..scene import Camera, CameraMotion, CameraRig, Lidar, Trajectory
 from .casting import Instances, build_geometry
 from .people_casting import (
     PeopleCast,
@@ -99,6 +99,38 @@ class SyntheticLog(DrivingLog):
             np.ascontiguousarray(k, dtype=np.float64),
             *size,
             source.config.samples,
+        )
+
+    def with_vehicles(self, changed: Mapping[str, Trajectory | None]) -> SyntheticLog:
+        """The drive on the same street with other traffic.
+
+        No config describes it, so its provenance has none.
+
+        Args:
+            changed: new trajectories of vehicles by id, None to remove one.
+
+        Raises:
+            ValueError: an id that is not of a vehicle.
+        """
+        source = self.source
+        assert isinstance(source, SyntheticSource)
+        drive = source.drive
+        ids = [track.object_id for track in self.tracks[: len(drive.vehicles)]]
+        if unknown := sorted(changed.keys() - set(ids)):
+            raise ValueError(f"no vehicles: {', '.join(unknown)}; vehicles are {', '.join(ids)}")
+        paths = [changed.get(name, drive.vehicles[i].trajectory) for i, name in enumerate(ids)]
+        kept = {i: path for i, path in enumerate(paths) if path is not None}
+        vehicles = [dataclasses.replace(drive.vehicles[i], trajectory=p) for i, p in kept.items()]
+        tracks = [dataclasses.replace(self.tracks[i], trajectory=p) for i, p in kept.items()]
+        return dataclasses.replace(
+            self,
+            source=dataclasses.replace(
+                source,
+                drive=dataclasses.replace(drive, vehicles=tuple(vehicles)),
+                body_paints=source.body_paints[list(kept)],
+            ),
+            tracks=(*tracks, *self.tracks[len(ids) :]),
+            provenance={k: v for k, v in self.provenance.items() if k != "config"},
         )
 
     def render_through(

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from real2sim_server.geometry import Float, apply_transform, invert_transform
 from real2sim_server.logs import DrivingLog, ObjectTrack, open_log
-from real2sim_server.scene import Camera
+from real2sim_server.scene import Camera, Trajectory
 from real2sim_server.synthetic import (
     CameraSpec,
     SyntheticConfig,
@@ -358,3 +358,34 @@ def test_the_truth_of_a_street_that_is_not_edited_is_what_was_recorded(log):
     size = (camera.width, camera.height)
     rgb, _, _ = log.render_placed(pose, camera.K, size, every, places)
     np.testing.assert_array_equal(rgb, log.image("front", 0))
+
+
+def test_a_street_without_a_vehicle_is_the_street_with_all_others(log):
+    camera, t_us = log.rig["front"], int(log.frame_times_us[0])
+    pose = camera.pose(log.ego.transform(t_us))
+    size = (camera.width, camera.height)
+    places = np.stack([track.trajectory.transform(t_us) for track in log.tracks])
+    others = range(1, len(log.tracks))
+    expected = log.render_placed(pose, camera.K, size, others, places[1:])
+    without = log.with_vehicles({log.tracks[0].object_id: None})
+    assert [t.object_id for t in without.tracks] == [t.object_id for t in log.tracks[1:]]
+    for found, image in zip(without.render(pose, camera.K, *size, t_us), expected, strict=True):
+        np.testing.assert_array_equal(found, image)
+    assert "config" not in without.provenance
+
+
+def test_a_vehicle_on_another_trajectory_keeps_its_place_among_the_tracks(log):
+    name, t_us = log.tracks[1].object_id, int(log.frame_times_us[0])
+    away = np.eye(4)
+    away[:3, 3] = (14.0, 2.0, 0.8)
+    moved = log.with_vehicles({name: Trajectory.from_transforms([t_us], [away])})
+    camera, pose = log.rig["front"], log.rig["front"].pose(log.ego.transform(t_us))
+    _, _, instance = moved.render(pose, camera.K, camera.width, camera.height, t_us)
+    columns = np.flatnonzero((instance == 2).any(axis=0))
+    assert [track.object_id for track in moved.tracks] == [t.object_id for t in log.tracks]
+    assert 0 < columns.mean() < camera.width / 2
+
+
+def test_only_vehicles_can_be_changed_on_a_street(log):
+    with pytest.raises(ValueError, match="no vehicles: nothing_7; vehicles are"):
+        log.with_vehicles({"nothing_7": None})

@@ -38,11 +38,15 @@ def psnr(
     return float("inf") if error == 0 else float(10 * np.log10(255**2 / error))
 
 
-def ssim(image: NDArray[np.uint8], truth: NDArray[np.uint8]) -> float:
-    """Mean structural similarity of RGB images [H, W, 3], 1 for equal ones.
+def ssim(
+    image: NDArray[np.uint8], truth: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None
+) -> float:
+    """Mean structural similarity of RGB images [H, W, 3] over ``mask`` [H, W], 1 for equal ones.
+
+    Nan where the mask is empty.
 
     Wang et al. 2004, eq. 13, with their Gaussian window of 11 taps and sigma 1.5 px, on each
-    channel and averaged over all pixels and channels. Outside the image everything is zero, as
+    channel and averaged over pixels and channels. Outside the image everything is zero, as
     in the evaluation of Kerbl et al. 2023, so results are comparable with published ones.
     """
     import cv2
@@ -63,7 +67,10 @@ def ssim(image: NDArray[np.uint8], truth: NDArray[np.uint8]) -> float:
     c1, c2 = SSIM_K1**2, SSIM_K2**2
     luminance = (2 * mean_x * mean_y + c1) / (mean_x**2 + mean_y**2 + c1)
     structure = (2 * covariance + c2) / (variance_x + variance_y + c2)
-    return float((luminance * structure).mean())
+    similarity = luminance * structure
+    if mask is not None:
+        similarity = similarity[mask]
+    return float(similarity.mean()) if similarity.size else float("nan")
 
 
 def mean_psnr(values: Iterable[float]) -> float:
@@ -249,12 +256,11 @@ def _sides(
         )
         rgb = (drawn.rgb[0].clamp(0, 1).cpu().numpy() * 255).round().astype(np.uint8)
         covered = drawn.alpha[0].cpu().numpy()[mask] > 0.5
-        offsets = np.abs(_wrapped(np.array(logged_from) - azimuth))
         sides.append(
             SideScore(
                 object_id=track.object_id,
                 azimuth=float(azimuth),
-                seen=bool((offsets <= SEEN_WITHIN).any()),
+                seen=is_seen(azimuth, logged_from),
                 psnr=psnr(rgb, image, mask),
                 coverage=float(covered.mean()),
             )
@@ -262,9 +268,10 @@ def _sides(
     return sides
 
 
-def _wrapped(angles: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Angles [rad] in [-pi, pi)."""
-    return np.asarray((angles + np.pi) % (2 * np.pi) - np.pi)
+def is_seen(azimuth: float, logged_from: Sequence[float]) -> bool:
+    """Whether a side was seen: within SEEN_WITHIN of one of :func:`logged_azimuths`."""
+    offsets = (np.array(logged_from) - azimuth + np.pi) % (2 * np.pi) - np.pi
+    return bool((np.abs(offsets) <= SEEN_WITHIN).any())
 
 
 def _mean(values: Sequence[float]) -> float:

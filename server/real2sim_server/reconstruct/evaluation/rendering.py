@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,8 @@ from ...scene import Camera, Scene
 from ..logged_view import image_time
 from ..options import ReconstructError
 from ..training.data import held_out_frames
+
+T = TypeVar("T")
 
 # Rendered views at recorded and shifted poses, and their frame rate.
 
@@ -39,15 +42,24 @@ def shifted_pose(T_world_vehicle: Float, left: float) -> Float:
 
 
 def render_view(
-    scene: Scene, camera: Camera, t_us: int, *, left: float = 0.0, backend: str = "auto"
+    scene: Scene,
+    camera: Camera,
+    t_us: int,
+    *,
+    left: float = 0.0,
+    instances: Iterable[Instance] | None = None,
+    backend: str = "auto",
 ) -> Frame:
     """Colour and depth of ``camera`` on the recording vehicle at ``t_us``, ``left`` of its path.
+
+    Args:
+        instances: what is drawn before the sky; everything as recorded by default.
 
     Raises:
         TimeOutOfRangeError: the scene's ego path does not cover ``t_us``.
     """
     [frame] = render_cameras(
-        scene_instances(scene, t_us),
+        scene_instances(scene, t_us) if instances is None else list(instances),
         [camera],
         shifted_pose(scene.ego.transform(t_us), left),
         sky=scene.sky,
@@ -204,6 +216,12 @@ def select_cameras(scene: Scene, log: DrivingLog, width: int | None) -> tuple[Ca
             f"{log.name!r}; evaluate it on the log it was made of"
         )
     return tuple(scene.rig[camera.name].resized(width or camera.width) for camera in log.rig)
+
+
+def spread(items: Sequence[T], limit: int) -> list[T]:
+    """At most ``limit`` of ``items``, evenly spread, in order."""
+    places = np.linspace(0, len(items) - 1, min(limit, len(items)))
+    return [items[i] for i in sorted({round(p) for p in places})]
 
 
 def listed_held_out(scene: Scene) -> list[int]:

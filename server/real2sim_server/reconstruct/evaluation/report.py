@@ -19,8 +19,9 @@ from ...render import Frame, encode_rgb
 from ...render.frame import uncertainty_picture
 from ...scene import Camera, Scene
 from ..logged_view import box_outline, image_time, moving_tracks
+from .edits import EditScore, apply_edit, compare_edit, edits_of
 from .images import Truth, find_truth
-from .rendering import render_uncertainty, render_view, select_cameras
+from .rendering import render_uncertainty, render_view, select_cameras, spread
 from .scores import CameraScore, EvaluateOptions, Evaluation, logged_pair
 from .shifted import true_view
 
@@ -191,11 +192,11 @@ def write_report(
     log = same_part(log, scene.provenance)
     cameras = select_cameras(scene, log, options.width)
     subject = _ReportContext(scene, log, evaluation, find_truth(log), options.backend)
-    frames = _spread(evaluation.frames, SHOWN_FRAMES)
+    frames = spread(evaluation.frames, SHOWN_FRAMES)
     parts = [
         _heading(evaluation),
         _figures(evaluation),
-        _shift_figures(evaluation) + _around_figures(evaluation),
+        _shift_figures(evaluation) + _around_figures(evaluation) + _edit_figures(evaluation),
         _uncertainty_figures(evaluation),
     ]
     parts.append("<h2>Recorded and rendered</h2>")
@@ -206,6 +207,9 @@ def write_report(
     for frame in frames:
         parts += [_view(subject, camera, frame) for camera in cameras]
     parts.append(_beside(subject, cameras[0], frames[len(frames) // 2]))
+    if evaluation.edits:
+        parts.append("<h2>Edited vehicles</h2>")
+        parts += [_edited(subject, cameras, score) for score in evaluation.edits]
     parts.append(_view_figures(evaluation))
     page = Path(folder) / PAGE
     page.parent.mkdir(parents=True, exist_ok=True)
@@ -271,6 +275,20 @@ def _around_figures(evaluation: Evaluation) -> str:
          str(len(around.sides) - seen)),
     ]  # fmt: skip
     return "<h2>Vehicles from all around</h2>" + _table(head, rows)
+
+
+def _edit_figures(evaluation: Evaluation) -> str:
+    if not evaluation.edits:
+        return ""
+    head = ("vehicle, edit", "PSNR [dB]", "SSIM", "pixels", "views",
+            "PSNR of revealed ground [dB]", "of shadows [dB]", "of unseen sides [dB]")  # fmt: skip
+    rows = [
+        (f"{s.object_id} ({s.vehicle}), {s.edit}", _number(s.psnr), _number(s.ssim, 3),
+         str(s.pixels), str(len(s.views)), _number(s.psnr_hidden_ground), _number(s.psnr_shadows),
+         _number(s.psnr_unseen))
+        for s in evaluation.edits
+    ]  # fmt: skip
+    return "<h2>Edited vehicles, where edits change the street</h2>" + _table(head, rows)
 
 
 def _uncertainty_figures(evaluation: Evaluation) -> str:
@@ -340,6 +358,29 @@ def _beside(subject: _ReportContext, camera: Camera, frame: int) -> str:
     return "".join(parts)
 
 
+def _edited(subject: _ReportContext, cameras: Sequence[Camera], score: EditScore) -> str:
+    """The view of an edit with the largest changed region, cut out."""
+    street = subject.truth.log
+    assert street is not None
+    shown = max(score.views, key=lambda view: view.pixels)
+    camera = next(camera for camera in cameras if camera.name == shown.camera)
+    edit = apply_edit(subject.scene, street, score.object_id, edits_of(score.object_id)[score.edit])
+    t_us = image_time(subject.log, camera.name, shown.frame)
+    view = compare_edit(subject.scene, edit, camera, t_us, backend=subject.backend)
+    rows, columns = (np.flatnonzero(view.region.any(axis=axis)) for axis in (1, 0))
+    window = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+    title = f"{score.object_id}, {score.edit}, frame {shown.frame}, {camera.name}"
+    return f"<h3>{escape(title)}: {_number(shown.psnr)} dB</h3>" + _row(
+        [
+            _Figure(view.before[window], "truth before the edit"),
+            _Figure(view.after[window], "truth after the edit"),
+            _Figure(view.rendered[window], "rendered"),
+            _Figure(error_image(view.rendered, view.after)[window], "error"),
+        ],
+        crops=True,
+    )
+
+
 def _row(shown: Sequence[_Figure], *, crops: bool = False) -> str:
     figures = []
     for item in shown:
@@ -365,8 +406,3 @@ def _number(value: float, digits: int = 2) -> str:
     if np.isnan(value):
         return "none"
     return f"{value:.{digits}f}" if np.isfinite(value) else "infinite"
-
-
-def _spread(frames: Sequence[int], limit: int) -> list[int]:
-    count = min(limit, len(frames))
-    return [frames[i] for i in sorted({round(p) for p in np.linspace(0, len(frames) - 1, count)})]

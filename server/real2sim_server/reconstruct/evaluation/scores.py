@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 from ...logs import DrivingLog, same_part
 from ...render import Frame
 from ...scene import Camera, Scene
+from ...synthetic import SyntheticLog
 from ..logged_view import image_time, moving_tracks, points_in_camera, resized, tracks_mask
 from ..options import OnProgress, ReconstructError, ReportStep, Stages
+from .edits import EditScore, evaluate_edits
 from .images import PSNR_CAP, AroundScore, evaluate_around, find_truth, mean_psnr, psnr, ssim
 from .lidar import LidarScore, depth_errors, error_p90, evaluate_sweeps, mean_error, median_error
 from .rendering import measure_rate, render_view, select_cameras, select_frames
@@ -66,6 +68,8 @@ class EvaluateOptions:
         repeats: timed renders.
         backend: backend of the renderer.
         around: whether to render vehicles from all sides, if truth exists.
+        edits: whether to edit vehicles and compare with the street that has the same edits; needs
+            truth.
         lidar: whether to cast and compare LiDAR sweeps, if the log has any.
 
     Raises:
@@ -79,6 +83,7 @@ class EvaluateOptions:
     repeats: int = 10
     backend: str = "auto"
     around: bool = False
+    edits: bool = False
     lidar: bool = False
 
     def __post_init__(self) -> None:
@@ -158,6 +163,8 @@ class Evaluation:
         no_shifted: the reason why it is empty; empty otherwise.
         lane_band: the road seen from shifted poses, against its appearance in other images.
         around: vehicles from all sides; None unless requested, or without truth.
+        edits: edited vehicles against the truth; None unless requested, empty if no compared frame
+            shows one.
         lidar: sweeps against the measured or true ones; None unless requested, or without sweeps.
         uncertainty: rendered uncertainty against true errors; None if the scene has none.
     """
@@ -183,6 +190,7 @@ class Evaluation:
     no_shifted: str = ""
     lane_band: tuple[LaneBandScore, ...] = ()
     around: AroundScore | None = None
+    edits: tuple[EditScore, ...] | None = None
     lidar: LidarScore | None = None
     uncertainty: UncertaintyScore | None = None
     timing_s: dict[str, float] = field(default_factory=dict)
@@ -194,7 +202,7 @@ class Evaluation:
         """
         values = _plain(asdict(self))
         values.pop("no_shifted" if self.shifted else "shifted")
-        for name in ("lidar", "uncertainty"):
+        for name in ("edits", "lidar", "uncertainty"):
             if values[name] is None:
                 values.pop(name)
         return dict(values)
@@ -214,7 +222,8 @@ def evaluate_scene(
     scene made of a part of the log, only that part is used, and its frames count from 0.
 
     Raises:
-        ReconstructError: the scene and the log do not belong together, or no frame is left.
+        ReconstructError: the scene and the log do not belong together, no frame is left, or edits
+            of a log without truth are requested.
         LogError: images or sweeps that cannot be read.
     """
     options = options or EvaluateOptions()
@@ -231,6 +240,7 @@ def evaluate_scene(
     ]
     if not pairs:
         raise ReconstructError(f"log {log.name!r} has no image at frames {list(chosen.frames)}")
+    street = _required_truth(log) if options.edits else None
     views, errors = [], []
     with stages("views") as report_step:
         for done, (camera, frame) in enumerate(pairs):
@@ -249,6 +259,12 @@ def evaluate_scene(
         lane_band = _lane_band(scene, log, cameras[0], chosen.frames, options)
     with stages("around"):
         around = _around(scene, log) if options.around else None
+    edits = None
+    if street is not None:
+        with stages("edits") as report_step:
+            edits = evaluate_edits(
+                scene, log, street, pairs, backend=options.backend, on_view=report_step
+            )
     with stages("uncertainty"):
         uncertainty = evaluate_uncertainty(scene, log, pairs, backend=options.backend)
     with stages("lidar"):
@@ -269,6 +285,7 @@ def evaluate_scene(
         no_shifted=missing,
         lane_band=lane_band,
         around=around,
+        edits=edits,
         lidar=lidar,
         uncertainty=uncertainty,
         timing_s=timing_s,
@@ -365,6 +382,16 @@ def _lane_band(
 def _around(scene: Scene, log: DrivingLog) -> AroundScore | None:
     truth = find_truth(log).log
     return None if truth is None else evaluate_around(scene, truth)
+
+
+def _required_truth(log: DrivingLog) -> SyntheticLog:
+    truth = find_truth(log)
+    if truth.log is None:
+        raise ReconstructError(
+            f"edits are compared with a true street, which this log lacks: {truth.missing}; "
+            "evaluate without edits"
+        )
+    return truth.log
 
 
 def _by_camera(

@@ -72,3 +72,14 @@ def test_ssim_is_one_for_equal_and_near_zero_for_unrelated_images():
     image = noise_image(5)
     assert ssim(image, image) == pytest.approx(1, abs=1e-12)
     assert abs(ssim(image, noise_image(6))) < 0.1
+
+
+def test_ssim_over_a_mask_is_the_mean_of_its_pixels():
+    image, truth = noise_image(3), noise_image(3)
+    image[:, 26:] = noise_image(4)[:, 26:]
+    left = np.zeros(image.shape[:2], bool)
+    left[:, :20] = True
+    assert ssim(image, truth, left) == pytest.approx(1)
+    parts = [ssim(image, truth, mask) * mask.mean() for mask in (left, ~left)]
+    assert sum(parts) == pytest.approx(ssim(image, truth))
+    assert np.isnan(ssim(image, truth, left & ~left))
