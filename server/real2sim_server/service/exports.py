@@ -156,18 +156,27 @@ def _render_request(video_source: VideoSource, sensor: SensorSpec, t_us: int) ->
 def pack(folder: Path, archive: Path, context: JobContext) -> None:
     """Pack all files below a folder reproducibly: without dates, users or permissions.
 
-    Deletes each file once it is packed, to save disk space.
+    Deletes each file once it is packed, to save disk space. Further names of a file (hard links)
+    are links in the archive.
 
     Raises:
         JobCancelled: the job was cancelled.
     """
+    packed: dict[int, str] = {}
     with tarfile.open(archive, "w", format=tarfile.PAX_FORMAT) as tar:
         for path in sorted(p for p in folder.rglob("*") if p.is_file()):
             context.check()
-            member = tarfile.TarInfo(str(path.relative_to(folder)))
-            member.size, member.mtime, member.mode = path.stat().st_size, 0, 0o644
-            with path.open("rb") as file:
-                tar.addfile(member, file)
+            member, about = tarfile.TarInfo(str(path.relative_to(folder))), path.stat()
+            member.mtime, member.mode = 0, 0o644
+            if about.st_ino in packed:
+                member.type, member.linkname = tarfile.LNKTYPE, packed[about.st_ino]
+                tar.addfile(member)
+            else:
+                member.size = about.st_size
+                with path.open("rb") as file:
+                    tar.addfile(member, file)
+                if about.st_nlink > 1:
+                    packed[about.st_ino] = member.name
             path.unlink()
 
 

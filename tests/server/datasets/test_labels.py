@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from real2sim_proto.conventions import GROUND
 from real2sim_server.datasets.clips import flow_png, read_flow
@@ -20,6 +21,7 @@ from real2sim_server.datasets.labels import (
     projected_box,
     views_of,
 )
+from real2sim_server.datasets.labels.boxes import truncation
 from real2sim_server.datasets.labels.images import body_of, on_surface
 from real2sim_server.datasets.labels.pixels import surface_mask
 from real2sim_server.render.lens import back_projected
@@ -61,6 +63,57 @@ def test_a_box_reaching_behind_the_camera_is_clipped_at_the_near_plane():
     left, _, right, _ = projected_box(pose(0, 0, 0), (2, 2, 10), CAMERA, np.eye(4))
     assert (left, right) == pytest.approx((48 - 600, 48 + 600))
     assert projected_box(pose(0, 0, -10), (2, 2, 2), CAMERA, np.eye(4)) is None
+
+
+def test_a_box_in_the_image_is_not_truncated():
+    assert truncation(pose(0, 0, 10), (2, 2, 2), CAMERA, np.eye(4)) == 0
+
+
+def test_half_of_a_box_across_the_image_border_is_truncated():
+    ahead = np.array([-0.8, 0, 1]) / np.hypot(0.8, 1)  # through the middle of the left border
+    facing = np.eye(4)
+    facing[:3, :3] = np.column_stack([np.cross([0, 1, 0], ahead), [0, 1, 0], ahead])
+    facing[:3, 3] = 12 * ahead
+    assert truncation(facing, (2, 2, 4), CAMERA, np.eye(4)) == pytest.approx(0.5)
+
+
+def test_the_part_of_a_box_behind_the_camera_is_truncated():
+    # Its side at x = 2 is in the image from z = 2.5 on and goes from -5 to 5.
+    assert truncation(pose(3, 0, 0), (2, 1, 10), CAMERA, np.eye(4)) == pytest.approx(0.75)
+    assert truncation(pose(0, 0, -10), (2, 2, 2), CAMERA, np.eye(4)) == 1
+    assert truncation(pose(0, 0, 1), (2, 2, 4), CAMERA, np.eye(4)) == 1  # around the camera
+
+
+def sampled_truncation(T_object: np.ndarray, size: np.ndarray, camera: Camera) -> float:
+    """Share outside the image of points spread evenly over the faces towards the camera at 0."""
+    outside = total = 0.0
+    spread = (np.stack(np.meshgrid(*[np.arange(60)] * 2), -1).reshape(-1, 2) + 0.5) / 60 - 0.5
+    for axis in range(3):
+        others = [k for k in range(3) if k != axis]
+        for end in (-0.5, 0.5):
+            points = np.full((len(spread), 3), end)
+            points[:, others] = spread
+            world = points * size @ T_object[:3, :3].T + T_object[:3, 3]
+            if np.sign(end) * (T_object[:3, axis] @ world[0]) < 0:
+                u, v, w = (world @ camera.K.T).T
+                with np.errstate(divide="ignore"):
+                    u, v = u / w, v / w
+                seen = (w > 0) & (u > 0) & (u < camera.width) & (v > 0) & (v < camera.height)
+                area = size[others[0]] * size[others[1]]
+                outside, total = outside + area * (~seen).mean(), total + area
+    return outside / total
+
+
+def test_truncation_is_the_share_of_the_surface_outside_the_image():
+    rng, found = np.random.default_rng(0), []
+    for turn in Rotation.random(200, random_state=0):
+        T_object = pose(*rng.uniform((-6, -4, -3), (6, 4, 12)))
+        T_object[:3, :3], size = turn.as_matrix(), rng.uniform(0.5, 6, 3)
+        if (np.abs(turn.inv().apply(T_object[:3, 3])) < size / 2).all():
+            continue  # around the camera
+        found.append(truncation(T_object, size, CAMERA, np.eye(4)))
+        assert found[-1] == pytest.approx(sampled_truncation(T_object, size, CAMERA), abs=0.02)
+    assert np.histogram(found, [0, 0.01, 0.3, 0.7, 0.99, 1.01])[0].min() >= 5
 
 
 def test_flow_of_a_wall_follows_the_camera():

@@ -17,12 +17,16 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from real2sim.cli import build_app
+from real2sim_server.datasets.clips import POINT, Clip
 from real2sim_server.datasets.writers import WRITERS
 from real2sim_server.datasets.writers.categories import CATEGORIES
+from real2sim_server.datasets.writers.kitti import VELODYNE, share, write_scans
 from real2sim_server.logs import LogError, open_log
+from real2sim_server.logs.readers.common import compensate_sweep
 from real2sim_server.scene.io import save_scene
 
 FRAMES, CAMERAS = 5, 2
@@ -133,6 +137,80 @@ def test_our_own_reader_finds_camera_images_and_points(exported, tiny_scene, fol
     away, nearest = KDTree(found).query(points["xyz"])
     assert away.max() < 1e-4
     assert len(np.unique(nearest)) == len(found)
+
+
+KITTI_SCANS = {
+    "kitti": "t*/training/velodyne/{}/*.bin",
+    "kitti_raw": "*/*_drive_{}_sync/velodyne_points/data/*.bin",
+}
+
+
+@pytest.mark.parametrize("folder", KITTI_SCANS)
+def test_the_kitti_sequences_of_all_cameras_have_one_copy_of_each_sweep(exported, folder):
+    front, left = (
+        sorted((exported / folder).glob(KITTI_SCANS[folder].format(name)))
+        for name in ("0000", "0001")
+    )
+    assert len(front) == len(labels(exported)["frames"])
+    assert all(one.samefile(other) for one, other in zip(front, left, strict=True))
+    names = {path.stat().st_ino for path in (exported / folder).rglob("*.bin")}
+    assert len(names) == FRAMES
+
+
+@pytest.mark.parametrize(
+    ("folder", "sequence"),
+    [("kitti/tracking", "0001"), ("kitti_raw/2011_09_26", "2011_09_26_drive_0001_sync")],
+)
+def test_kitti_points_and_boxes_of_a_side_camera_are_in_place(
+    exported, tiny_scene, folder, sequence
+):
+    log = open_first_clip(exported, folder, sequence)
+    to_camera = np.linalg.inv(log.rig["image_02"].T_vehicle_camera)
+    given_to_camera = np.linalg.inv(tiny_scene.rig["left"].T_vehicle_camera)
+    frame = labels(exported)["frames"][1]
+    points = np.load(exported / "labels/0000/points/000001.npy")["xyz"]
+    found = log.lidar(1).points
+    np.testing.assert_allclose(
+        found @ to_camera[:3, :3].T + to_camera[:3, 3],
+        points @ given_to_camera[:3, :3].T + given_to_camera[:3, 3],
+        atol=1e-4,
+    )
+    t_us = int(log.frame_times_us[1])
+    T_camera_world = to_camera @ np.linalg.inv(log.ego.transform(t_us))
+    places = [T_camera_world @ pose for pose, _ in boxes_of_log(log, t_us).values()]
+    for subject in frame["objects"]:
+        truth = given_to_camera @ subject["T_ego_object"]
+        assert min(np.abs(pose - truth).max() for pose in places) < 1e-6
+
+
+def test_kitti_scans_of_a_curve_have_every_point_in_place_or_not_at_all(tmp_path):
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[:, :3, :3] = Rotation.from_euler("z", [[0.0], [0.02], [0.04]]).as_matrix()
+    poses[:, 0, 3] = 0, 1.2, 2.4
+    rng = np.random.default_rng(0)
+    rows = np.zeros(20_000, POINT)
+    azimuth, away = rng.uniform(-np.pi, np.pi, len(rows)), rng.uniform(4, 60, len(rows))
+    rows["xyz"] = np.stack([away * np.cos(azimuth), away * np.sin(azimuth), np.ones(len(rows))], -1)
+    (tmp_path / "points").mkdir()
+    for k in range(3):
+        np.save(tmp_path / "points" / f"{k:06d}.npy", rows)
+    frames = [{"T_world_ego": pose.tolist()} for pose in poses]
+    paths = write_scans(Clip(tmp_path, "0000", "train", frames), tmp_path)
+    scan = np.fromfile(paths[1], np.float32).reshape(-1, 4)[:, :3].astype(np.float64)
+    offset = -np.arctan2(scan[:, 1], scan[:, 0]) / (2 * np.pi)
+    found = compensate_sweep(scan + VELODYNE, offset, poses, 1)
+    assert len(found) > 0.99 * len(rows)
+    assert KDTree(rows["xyz"]).query(found)[0].max() < 1e-3
+
+
+def test_kitti_scans_are_copied_where_links_are_refused(tmp_path, monkeypatch):
+    def refuse(*_args: object) -> None:
+        raise PermissionError
+
+    monkeypatch.setattr("os.link", refuse)
+    (tmp_path / "one").write_bytes(b"scan")
+    share(tmp_path / "one", tmp_path / "there" / "two")
+    assert (tmp_path / "there" / "two").read_bytes() == b"scan"
 
 
 def test_kitti_object_rows_have_fifteen_columns_for_visible_objects(exported):

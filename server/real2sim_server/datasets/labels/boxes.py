@@ -32,6 +32,9 @@ EDGES = (
 )  # fmt: skip
 """Edges between corners in the order of ``box_corners``."""
 
+FACES = (((0, 2, 6, 4), (1, 3, 7, 5)), ((0, 1, 5, 4), (2, 3, 7, 6)), ((0, 1, 3, 2), (4, 5, 7, 6)))
+"""Corners around the faces at the negative and the positive end of x, y and z."""
+
 Box2D = tuple[float, float, float, float]
 """Left, top, right, bottom [px]; pixel (0, 0) extends from 0 to 1."""
 
@@ -110,9 +113,51 @@ def cut_at_border(box: Box2D, width: int, height: int) -> Box2D | None:
     return cut if cut[0] < cut[2] and cut[1] < cut[3] else None
 
 
-def area(box: Box2D) -> float:
-    """Area [px^2]."""
-    return (box[2] - box[0]) * (box[3] - box[1])
+def truncation(
+    T_world_object: Float, size: Sequence[float], camera: Camera, T_world_camera: Float
+) -> float:
+    """Share of a 3D box outside the image, 0 to 1: of the area of the faces that face the camera.
+
+    What is behind the camera is outside; so is a box around the camera.
+    """
+    T_camera_object = invert_transform(T_world_camera) @ T_world_object
+    corners = box_corners(T_camera_object, size)
+    eye = invert_transform(T_camera_object)[:3, 3]
+    x, y, z = camera.K
+    # Planes from the camera's position through the image borders, positive towards the image. All
+    # four are positive only in front of the camera.
+    borders = (x, camera.width * z - x, y, camera.height * z - y)
+    if (corners @ np.array(borders).T >= 0).all():
+        return 0.0
+    whole = inside = 0.0
+    for axis, ends in enumerate(FACES):
+        if abs(eye[axis]) > size[axis] / 2:
+            face = corners[list(ends[int(eye[axis] > 0)])]
+            whole += _area(face)
+            for border in borders:
+                face = _cut(face, border)
+            inside += _area(face)
+    return min(max(1 - inside / whole, 0.0), 1.0) if whole else 1.0
+
+
+def _cut(polygon: Float, plane: Float) -> Float:
+    """The part [M, 3] of a convex polygon [N, 3] on the positive side of a plane through 0."""
+    sides = (polygon @ plane).tolist()
+    kept = []
+    for k, side in enumerate(sides):
+        if (side < 0) != (sides[k - 1] < 0):
+            kept.append(polygon[k] + (polygon[k - 1] - polygon[k]) * side / (side - sides[k - 1]))
+        if side >= 0:
+            kept.append(polygon[k])
+    return np.array(kept).reshape(-1, 3)
+
+
+def _area(polygon: Float) -> float:
+    """Area of a flat polygon [N, 3]."""
+    if len(polygon) < 3:
+        return 0.0
+    spokes = polygon[1:] - polygon[0]
+    return float(np.linalg.norm(np.cross(spokes[:-1], spokes[1:]).sum(axis=0))) / 2
 
 
 def in_frame(box: ObjectBox, T_frame_world: Float) -> tuple[Float, Float]:

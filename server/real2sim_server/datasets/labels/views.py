@@ -15,7 +15,7 @@ from ...geometry import Float, apply_transform, invert_transform
 from ...render import Backend, Instance, RasterOptions, rasterize
 from ...render.types import Window
 from ...scene import Scene, Stride
-from .boxes import NEAR, Box2D, ObjectBox, area, cut_at_border, projected_box
+from .boxes import NEAR, Box2D, ObjectBox, cut_at_border, projected_box, truncation
 from .images import CameraImages, body_of, rays_of, window_about
 from .pixels import surface_mask
 
@@ -30,7 +30,8 @@ HOW = {
     "border of the image",
     "visibility": "rendered: pixels of the object in the scene over those it fills when it is "
     "drawn alone",
-    "truncation": "box: share of the projected 3D box's bounding box outside of the image",
+    "truncation": "box: share of the 3D box outside of the image, by area of the faces towards the "
+    "camera",
     "instance": "rendered: object of a pixel's front, the Gaussian that takes its light to a fifth "
     "(where that is not reached, or passes draw labels, to a half); an object's shadow is ground",
     "semantic": "rendered: class of the object by its category; of the background the ground by "
@@ -70,7 +71,7 @@ class ObjectView:
         modal_box: bounds of the object's visible pixels [px]; None without any.
         visible_pixels: number of the object's visible pixels.
         alone_pixels: number of its pixels in this image without other objects.
-        truncation: share of the projected box outside the image, 0 to 1.
+        truncation: share of the 3D box outside the image, 0 to 1.
     """
 
     object_id: str
@@ -129,7 +130,7 @@ def views_of(
                 modal_box=modal,
                 visible_pixels=visible,
                 alone_pixels=_pixels_of(depth, window, box, images),
-                truncation=min(max(1 - area(seen) / area(whole), 0.0), 1.0),
+                truncation=truncation(box.T_world_object, box.size, camera, images.T_world_camera),
             )
         )
     return CameraView(images, tuple(found))

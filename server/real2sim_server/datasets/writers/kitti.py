@@ -5,18 +5,20 @@ from __future__ import annotations
 import datetime
 import itertools
 import math
+import os
 import shutil
+import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import escape
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ...geometry import Float, apply_transform, invert_transform
+from ...geometry import Float, invert_transform
 from ...logs.readers.common import compensate_sweep
 from ...scene import Camera
-from ...scene.camera import T_VEHICLE_OPTICAL
 from ..clips import Clip
 from .categories import classes_of
 from .writer import LabelledDrive, objects_of, write_json
@@ -28,10 +30,15 @@ OCCLUDED = (0.85, 0.45)
 """Minimum visibility of fully (0) and partly (1) visible objects; below it is 2."""
 
 VELODYNE = (0.9, 0.0, 1.73)
-"""Position of the scanner in the vehicle's frame [m], at KITTI's height above the road."""
+"""Position of the scanner in the ego frame [m], at KITTI's height above the road. Its axes are the
+ego's, so that the sequences of all cameras have the same scans."""
 
-ROUNDS = 8
-"""Iterations to invert the motion compensation of a point."""
+T_EGO_VELO = np.eye(4)
+T_EGO_VELO[:3, 3] = VELODYNE
+
+ROUNDS, SETTLED = 8, 1e-4
+"""Maximum number of iterations to invert the motion compensation of a point, and the size of the
+last step [m]."""
 
 
 class KittiWriter:
@@ -43,27 +50,41 @@ class KittiWriter:
     def write(self, drive: LabelledDrive, folder: Path) -> None:
         """See :class:`DatasetWriter`. Raises OSError."""
         sequences: dict[str, dict[str, str]] = {}
+        tracking, single = (folder / name / "training" for name in ("tracking", "object"))
         numbers = itertools.count()
         for clip in drive.clips:
-            for camera in drive.cameras:
-                name = f"{len(sequences):04d}"
-                sequences[name] = {"clip": clip.name, "camera": camera.name, "split": clip.split}
-                _write_sequence(folder / "tracking" / "training", name, clip, camera)
-                for frame in clip.frames:
-                    _write_object_frame(
-                        folder / "object" / "training", next(numbers), clip, camera, frame
-                    )
+            with tempfile.TemporaryDirectory(dir=folder) as place:
+                scans = write_scans(clip, Path(place))
+                for camera in drive.cameras:
+                    name = f"{len(sequences):04d}"
+                    sequences[name] = {
+                        "clip": clip.name,
+                        "camera": camera.name,
+                        "split": clip.split,
+                    }
+                    _write_sequence(tracking, name, clip, camera, scans)
+                    _write_object_frames(single, numbers, clip, camera, scans)
         write_json(folder / "sequences.json", sequences)
 
 
-def _write_sequence(root: Path, name: str, clip: Clip, camera: Camera) -> None:
-    for part in ("image_02", "velodyne"):
-        (root / part / name).mkdir(parents=True)
+def share(source: Path, target: Path) -> None:
+    """Give a file a second name, so that it is stored once; a copy where the file system refuses
+    hard links."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copyfile(source, target)
+
+
+def _write_sequence(
+    root: Path, name: str, clip: Clip, camera: Camera, scans: Sequence[Path]
+) -> None:
     tracks = _track_numbers(clip)
     seen, all_around = [], []
     for k, frame in enumerate(clip.frames):
-        shutil.copyfile(clip.file("rgb", camera.name, k), root / "image_02" / name / f"{k:06d}.png")
-        write_scan(root / "velodyne" / name / f"{k:06d}.bin", clip, camera, k)
+        share(clip.file("rgb", camera.name, k), root / "image_02" / name / f"{k:06d}.png")
+        share(scans[k], root / "velodyne" / name / f"{k:06d}.bin")
         for row in _seen_rows(frame, camera):
             seen.append(f"{k} {tracks[row['object_id']]} {_columns(row)}")
         for row in _all_rows(frame, camera):
@@ -82,17 +103,17 @@ def _write_sequence(root: Path, name: str, clip: Clip, camera: Camera) -> None:
     _write_lines(root / "times" / f"{name}.txt", times)
 
 
-def _write_object_frame(
-    root: Path, number: int, clip: Clip, camera: Camera, frame: Mapping[str, Any]
+def _write_object_frames(
+    root: Path, numbers: Iterator[int], clip: Clip, camera: Camera, scans: Sequence[Path]
 ) -> None:
-    name, index = f"{number:06d}", frame["index"]
-    for part in ("image_2", "velodyne"):
-        (root / part).mkdir(parents=True, exist_ok=True)
-    shutil.copyfile(clip.file("rgb", camera.name, index), root / "image_2" / f"{name}.png")
-    write_scan(root / "velodyne" / f"{name}.bin", clip, camera, index)
-    labels = [_columns(row) for row in _seen_rows(frame, camera)]
-    _write_lines(root / "label_2" / f"{name}.txt", labels)
-    _write_lines(root / "calib" / f"{name}.txt", _calibration(camera, "R0_rect", "Tr_velo_to_cam"))
+    calibration = _calibration(camera, "R0_rect", "Tr_velo_to_cam")
+    for k, frame in enumerate(clip.frames):
+        name = f"{next(numbers):06d}"
+        share(clip.file("rgb", camera.name, k), root / "image_2" / f"{name}.png")
+        share(scans[k], root / "velodyne" / f"{name}.bin")
+        labels = [_columns(row) for row in _seen_rows(frame, camera)]
+        _write_lines(root / "label_2" / f"{name}.txt", labels)
+        _write_lines(root / "calib" / f"{name}.txt", calibration)
 
 
 def _track_numbers(clip: Clip) -> dict[str, int]:
@@ -153,61 +174,46 @@ def _calibration(camera: Camera, rectification: str, velo_to_cam: str) -> list[s
     K = camera.K.copy()
     K[:2, 2] -= 0.5
     projection = np.concatenate([K, np.zeros((3, 1))], axis=1)
-    T_camera_velo = velodyne_in_camera(camera)
-    imu = invert_transform(shift(VELODYNE))
+    T_camera_velo = invert_transform(camera.T_vehicle_camera) @ T_EGO_VELO
     return [
         *(f"P{k}: {numbers(projection.ravel())}" for k in range(4)),
         f"{rectification}: {numbers(np.eye(3).ravel())}",
         f"{velo_to_cam}: {numbers(T_camera_velo[:3].ravel())}",
-        f"Tr_imu_to_velo: {numbers(imu[:3].ravel())}",
+        f"Tr_imu_to_velo: {numbers(invert_transform(T_EGO_VELO)[:3].ravel())}",
     ]
 
 
-def velodyne_in_camera(camera: Camera) -> Float:
-    """Pose of the scanner, aligned with the camera, as in KITTI's vehicle frame."""
-    T_vehicle_velo = np.eye(4)
-    T_vehicle_velo[:3, :3] = camera.T_vehicle_camera[:3, :3] @ T_VEHICLE_OPTICAL[:3, :3].T
-    T_vehicle_velo[:3, 3] = T_vehicle_velo[:3, :3] @ np.array([VELODYNE[0], VELODYNE[1], 0.0])
-    T_vehicle_velo[2, 3] = VELODYNE[2]
-    return invert_transform(camera.T_vehicle_camera) @ T_vehicle_velo
+def write_scans(clip: Clip, folder: Path) -> list[Path]:
+    """Write the scan of each frame: x, y, z and reflectance of each point, float32, as measured by
+    the moving scanner."""
+    poses = np.array([frame["T_world_ego"] for frame in clip.frames])
+    paths = [folder / f"{k}.bin" for k in range(len(clip.frames))]
+    for k, path in enumerate(paths):
+        rows = clip.points(k)
+        points, met = _as_measured(rows["xyz"].astype(np.float64), poses, k)
+        scan = np.empty((len(rows), 4), "<f4")
+        scan[:, :3] = points - VELODYNE
+        scan[:, 3] = rows["intensity"]
+        path.write_bytes(scan[met].tobytes())
+    return paths
 
 
-def vehicle_in_ego(camera: Camera) -> Float:
-    """Pose of KITTI's vehicle frame, aligned with the camera's direction."""
-    return camera.T_vehicle_camera @ velodyne_in_camera(camera) @ invert_transform(shift(VELODYNE))
+def _as_measured(points: Float, poses: Float, frame: int) -> tuple[Float, NDArray[np.bool_]]:
+    """Points [N, 3] of one instant, moved to the ego frame at their times of measurement; mask [N]
+    of those that the scan meets.
 
-
-def shift(position: Sequence[float]) -> Float:
-    """A position [m] as a transform."""
-    matrix = np.eye(4)
-    matrix[:3, 3] = position
-    return matrix
-
-
-def write_scan(path: Path, clip: Clip, camera: Camera, frame: int) -> None:
-    """x, y, z and reflectance of each point, float32, as measured by the moving scanner."""
-    rows = clip.points(frame)
-    T_vehicle_velo = shift(VELODYNE)
-    vehicle = vehicle_in_ego(camera)
-    poses = np.array([f["T_world_ego"] for f in clip.frames]) @ vehicle
-    points = apply_transform(invert_transform(vehicle), rows["xyz"].astype(np.float64))
-    to_velo = invert_transform(T_vehicle_velo)
-    scan = np.empty((len(rows), 4), "<f4")
-    scan[:, :3] = apply_transform(to_velo, _as_measured(points, poses, frame, to_velo))
-    scan[:, 3] = rows["intensity"]
-    path.write_bytes(scan.tobytes())
-
-
-def _as_measured(points: Float, poses: Float, frame: int, to_velo: Float) -> Float:
-    """Points [N, 3] of one instant, moved to the vehicle frame at their times of measurement.
-
-    The scanner turns clockwise once per frame and looks ahead at the frame's time."""
-    measured = points
+    The scanner turns clockwise once per frame and looks ahead at the frame's time. In a curve, it
+    misses a strip straight behind it."""
+    measured, left = points.copy(), np.arange(len(points))
     for _ in range(ROUNDS):
-        local = apply_transform(to_velo, measured)
-        offset = -np.arctan2(local[:, 1], local[:, 0]) / (2 * np.pi)
-        measured = measured + (points - compensate_sweep(measured, offset, poses, frame))
-    return measured
+        here = measured[left]
+        offset = -np.arctan2(here[:, 1] - VELODYNE[1], here[:, 0] - VELODYNE[0]) / (2 * np.pi)
+        step = points[left] - compensate_sweep(here, offset, poses, frame)
+        measured[left] = here + step
+        left = left[np.abs(step).max(axis=1) > SETTLED]
+    met = np.ones(len(points), np.bool_)
+    met[left] = False
+    return measured, met
 
 
 def numbers(values: Any) -> str:
@@ -224,7 +230,7 @@ def _write_lines(path: Path, lines: Sequence[str]) -> None:
 
 # A drive for each clip and camera, with GPS/IMU records and tracklets. Source: Geiger et al.,
 # "Vision meets Robotics: The KITTI Dataset", IJRR 2013, and the raw data's development kit. Camera,
-# scanner and scans are as above. The GPS/IMU unit is at the ego's origin. Boxes rotate about the
+# scanner and scans are as above. The GPS/IMU unit has the ego frame. Boxes rotate about the
 # scanner's vertical axis only.
 
 DAY = "2011_09_26"
@@ -243,26 +249,28 @@ class KittiRawWriter:
         """See :class:`DatasetWriter`. Raises OSError."""
         drives: dict[str, dict[str, str]] = {}
         for clip in drive.clips:
-            for camera in drive.cameras:
-                name = f"{DAY}_drive_{len(drives):04d}_sync"
-                drives[name] = {"clip": clip.name, "camera": camera.name, "split": clip.split}
-                _write_drive(folder / DAY / name, clip, camera)
+            with tempfile.TemporaryDirectory(dir=folder) as place:
+                scans = write_scans(clip, Path(place))
+                for camera in drive.cameras:
+                    name = f"{DAY}_drive_{len(drives):04d}_sync"
+                    drives[name] = {"clip": clip.name, "camera": camera.name, "split": clip.split}
+                    _write_drive(folder / DAY / name, clip, camera, scans)
         write_json(folder / "drives.json", drives)
 
 
-def _write_drive(folder: Path, clip: Clip, camera: Camera) -> None:
+def _write_drive(folder: Path, clip: Clip, camera: Camera, scans: Sequence[Path]) -> None:
     for part in ("image_02", "velodyne_points", "oxts"):
         (folder / part / "data").mkdir(parents=True)
         stamps = "".join(f"{_stamp(frame['t_us'])}\n" for frame in clip.frames)
         (folder / part / "timestamps.txt").write_text(stamps)
-    world = np.array([frame["T_world_ego"] for frame in clip.frames]) @ vehicle_in_ego(camera)
     for k, frame in enumerate(clip.frames):
         image = clip.file("rgb", camera.name, frame["index"])
-        shutil.copyfile(image, folder / "image_02" / "data" / f"{k:010d}.png")
-        write_scan(folder / "velodyne_points" / "data" / f"{k:010d}.bin", clip, camera, k)
-        (folder / "oxts" / "data" / f"{k:010d}.txt").write_text(_oxts(world[k]) + "\n")
+        share(image, folder / "image_02" / "data" / f"{k:010d}.png")
+        share(scans[k], folder / "velodyne_points" / "data" / f"{k:010d}.bin")
+        oxts = _oxts(np.array(frame["T_world_ego"]))
+        (folder / "oxts" / "data" / f"{k:010d}.txt").write_text(oxts + "\n")
     _write_calibration(folder, camera)
-    (folder / "tracklet_labels.xml").write_text(_tracklets(clip, camera), encoding="utf-8")
+    (folder / "tracklet_labels.xml").write_text(_tracklets(clip), encoding="utf-8")
 
 
 def _stamp(t_us: int) -> str:
@@ -291,8 +299,8 @@ def _write_calibration(folder: Path, camera: Camera) -> None:
     cameras += [f"P_rect_{k:02d}: {numbers(projection.ravel())}" for k in range(4)]
     lines = {
         "cam_to_cam": cameras,
-        "velo_to_cam": _rigid_lines(velodyne_in_camera(camera)),
-        "imu_to_velo": _rigid_lines(invert_transform(shift(VELODYNE))),
+        "velo_to_cam": _rigid_lines(invert_transform(camera.T_vehicle_camera) @ T_EGO_VELO),
+        "imu_to_velo": _rigid_lines(invert_transform(T_EGO_VELO)),
     }
     for name, rows in lines.items():
         (folder / f"calib_{name}.txt").write_text("".join(f"{row}\n" for row in rows))
@@ -303,8 +311,8 @@ def _rigid_lines(transform: Float) -> list[str]:
     return [f"calib_time: {DAY}", f"R: {numbers(turn)}", f"T: {numbers(place)}"]
 
 
-def _tracklets(clip: Clip, camera: Camera) -> str:
-    to_velo = invert_transform(shift(VELODYNE)) @ invert_transform(vehicle_in_ego(camera))
+def _tracklets(clip: Clip) -> str:
+    to_velo = invert_transform(T_EGO_VELO)
     items = [line for run in _runs(clip) for line in _tracklet(run, to_velo)]
     count = sum(line == "<item>" for line in items)
     head = [

@@ -6,6 +6,7 @@ import base64
 import io
 import json
 import tarfile
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -15,6 +16,7 @@ from fastapi.testclient import TestClient
 from real2sim_proto import ErrorCode
 from real2sim_server.scene.io import save_scene
 from real2sim_server.service.app import create_app
+from real2sim_server.service.exports import pack
 from real2sim_server.settings import Settings
 
 from ..waiting import finished
@@ -76,6 +78,18 @@ def test_a_data_set_is_one_archive_with_manifest_and_licence(client, job):
     assert file_of(client, job, "manifest.json") == held["manifest.json"]
     names = {name for name in held if name != "manifest.json"}
     assert set(json.loads(held["manifest.json"])["files"]) == names
+
+
+def test_a_file_with_several_names_is_in_the_archive_once(tmp_path):
+    folder = tmp_path / "set"
+    folder.mkdir()
+    (folder / "a.bin").write_bytes(bytes(100_000))
+    (folder / "b.bin").hardlink_to(folder / "a.bin")
+    (folder / "c.bin").write_bytes(b"other")
+    pack(folder, tmp_path / "set.tar", SimpleNamespace(check=lambda: None))
+    archive = (tmp_path / "set.tar").read_bytes()
+    assert len(archive) < 150_000
+    assert members(archive) == {"a.bin": bytes(100_000), "b.bin": bytes(100_000), "c.bin": b"other"}
 
 
 def test_a_data_set_has_preview_sheets(client, job):
