@@ -181,6 +181,8 @@ TRIMMINGS = 3
 """Rounds of dropping outliers, such as a tree at the top."""
 BRIGHTER = 1.2
 """Minimum ratio of the brightness of the sky to the rest of the image."""
+HORIZON = math.radians(1.0)
+"""Margin of the horizon for pitch and roll of the vehicle [rad]."""
 CLEAR = 2
 """Radius around LiDAR returns without sky [px]."""
 
@@ -211,7 +213,8 @@ def sky_mask(
     sweep = log.lidar(frame) if sweep is None else sweep
     t_us = image_time(log, camera.name, frame)
     pixels, inside = _pixels(small, points_in_camera(log, small, frame, t_us, sweep=sweep))
-    blocked = _hit(small, pixels) | ~_above_horizon(small, small.pose(log.ego.transform(t_us)))
+    pose = small.pose(log.ego.transform(t_us))
+    blocked = _hit(small, pixels) | ~(_rise(small, pose) > 0)
     blocked |= ~_outside_of_boxes(log, small, frame)
     is_open = _open_columns(small, pixels, _is_high(sweep)[inside])
     mask = sky_of_image(resized(image, small), blocked, is_open).astype(np.uint8)
@@ -267,11 +270,17 @@ def _outside_of_boxes(log: DrivingLog, camera: Camera, frame: int) -> NDArray[np
     return ~tracks_mask(log.tracks, camera, pose, t_us, margin=BOX_MARGIN)
 
 
-def _above_horizon(camera: Camera, pose: Float) -> NDArray[np.bool_]:
-    """[H, W] bool, pixels above the horizon."""
+def below_horizon(log: DrivingLog, camera: Camera, frame: int) -> NDArray[np.bool_]:
+    """Pixels [H, W] more than HORIZON below the horizon, which cannot show the sky."""
+    pose = camera.pose(log.ego.transform(image_time(log, camera.name, frame)))
+    return np.asarray(_rise(camera, pose) < -math.sin(HORIZON))
+
+
+def _rise(camera: Camera, pose: Float) -> Float:
+    """Sine [H, W] of the elevation of the pixels' rays; nan for pixels without a ray."""
     v, u = np.mgrid[: camera.height, : camera.width] + 0.5
     rays, valid = camera.unproject(np.stack([u, v], -1))
-    return valid & (rays @ pose[2, :3] > 0)
+    return np.where(valid, rays @ pose[2, :3] / np.linalg.norm(rays, axis=-1), np.nan)
 
 
 def _pixels(camera: Camera, points: Float) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
@@ -372,4 +381,4 @@ def _connected(mask: NDArray[np.bool_]) -> tuple[NDArray[np.int32], NDArray[np.i
     return np.asarray(found[1], np.int32), np.asarray(found[2][:, cv2.CC_STAT_AREA], np.int32)
 
 
-__all__ = ["sky_mask", "sky_of_image", "still_surfaces"]
+__all__ = ["below_horizon", "sky_mask", "sky_of_image", "still_surfaces"]

@@ -5,7 +5,12 @@ import pytest
 
 from real2sim_server.geometry import box_corners
 from real2sim_server.logs import ObjectTrack
-from real2sim_server.reconstruct.logged_view import box_outline, moving_tracks, tracks_mask
+from real2sim_server.reconstruct.logged_view import (
+    below_horizon,
+    box_outline,
+    moving_tracks,
+    tracks_mask,
+)
 from real2sim_server.scene import Camera, Trajectory
 
 from .conftest import painted_log
@@ -75,3 +80,12 @@ def test_only_moving_tracks_are_selected():
     log = painted_log()
     assert [t.object_id for t in moving_tracks(log)] == ["other_1"]
     assert moving_tracks(painted_log(frames=2)) == ()
+
+
+def test_pixels_below_the_horizon_of_a_level_camera():
+    log = painted_log(frames=2)
+    camera = log.rig.cameras[0]
+    below = below_horizon(log, camera, 0)
+    v, u = np.mgrid[: camera.height, : camera.width] + 0.5
+    x, y = (u - camera.K[0, 2]) / camera.K[0, 0], (v - camera.K[1, 2]) / camera.K[1, 1]
+    assert (below == (y > np.tan(np.radians(1)) * np.hypot(x, 1))).all()

@@ -350,11 +350,15 @@ class SkySamples:
         return ahead[inside], u[inside], v[inside]
 
     def finish(self, ground_colour: NDArray[np.float32]) -> Sky:
-        """The cube map: medians of the observed directions, smoothly filled elsewhere."""
+        """The cube map: medians of the observed directions, elsewhere the nearest sky colours.
+
+        Trees and walls without a Gaussian continue nowhere, unless no sky was seen at all.
+        """
         known = self._counts > 0
         texels = np.zeros((len(self._directions), 3), dtype=np.float32)
         texels[known] = self._median(known)
-        fill = _panorama(self._directions, texels, known, ground_colour)
+        continued = self._is_sky if self._is_sky.any() else known
+        fill = _panorama(self._directions, texels, continued, ground_colour)
         texels[~known] = _look_up(fill, self._directions[~known])
         r = self._resolution
         return Sky(torch.from_numpy(texels.reshape(6, r, r, 3).clip(0, 1)))

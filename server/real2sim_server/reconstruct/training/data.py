@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ...logs import DrivingLog, LidarSweep, log_of_frames
 from ...scene import Camera
-from ..logged_view import image_time, points_in_camera, resized, sky_mask
+from ..logged_view import below_horizon, image_time, points_in_camera, resized, sky_mask
 from ..options import ReconstructError
 from .schedule import TrainOptions
 
@@ -54,8 +54,8 @@ class TrainingView:
         image: [H, W, 3] float32 in [0, 1].
         pixels: [M] int64, row-major pixels with a LiDAR return.
         depths: [M] float32 along the camera's z [m].
-        sky: [H, W] float32, 1 in the sky, less near its border and 0 elsewhere; None if no loss
-            uses it.
+        sky: [H, W] float32, 1 in the sky, less near its border, -1 below the horizon and 0
+            elsewhere; None if no loss uses it.
     """
 
     camera: Camera
@@ -71,7 +71,7 @@ class TrainingView:
 class _CachedImage:
     image: NDArray[np.uint8]
     points: NDArray[np.float32]
-    sky: NDArray[np.bool_] | None
+    sky: NDArray[np.int8] | None
 
     @property
     def nbytes(self) -> int:
@@ -227,7 +227,10 @@ class TrainingViews:
         log, losses, full = self._log, self._options.losses, self._log.rig[name]
         small = full.resized(self._width(full))
         image, sweep = resized(log.image(name, frame), small), log.lidar(frame)
-        sky = sky_mask(log, small, frame, image, sweep=sweep) if losses.sky > 0 else None
+        sky = None
+        if losses.sky > 0:
+            sky = sky_mask(log, small, frame, image, sweep=sweep).astype(np.int8)
+            sky[below_horizon(log, small, frame)] = -1
         return _CachedImage(image, self._points(full, frame, sweep), sky)
 
     def _points(self, camera: Camera, frame: int, sweep: LidarSweep) -> NDArray[np.float32]:
@@ -257,13 +260,18 @@ def _nbytes(view: TrainingView) -> int:
     return sum(part.numel() * part.element_size() for part in _parts(view).values())
 
 
-def _weights(sky: NDArray[np.bool_], camera: Camera) -> NDArray[np.float32]:
-    """[H, W] of ``sky`` at the size of ``camera``: 1 inside, less within SKY_BORDER of its edge."""
+def _weights(sky: NDArray[np.int8], camera: Camera) -> NDArray[np.float32]:
+    """[H, W] of ``sky`` at the size of ``camera``, see TrainingView; less than 1 within SKY_BORDER
+    of the edge of the sky.
+    """
     import cv2
 
-    whole = (resized(sky.astype(np.uint8) * 255, camera) == 255).astype(np.uint8)
+    whole, solid = (
+        (resized((sky == value).astype(np.uint8) * 255, camera) == 255).astype(np.uint8)
+        for value in (1, -1)
+    )
     within = cv2.distanceTransform(whole, cv2.DIST_L2, 5) / SKY_BORDER
-    return np.asarray(np.minimum(within, 1), np.float32)
+    return np.asarray(np.minimum(within, 1) - solid, np.float32)
 
 
 def _pixels(

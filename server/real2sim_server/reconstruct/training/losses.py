@@ -25,7 +25,8 @@ class LossWeights:
     Attributes:
         ssim: fraction of 1 - SSIM in the photometric loss, the rest is L1 (Kerbl et al. 2023).
         depth: mean distance from LiDAR along the view [m] (drivestudio: 0.01).
-        sky: cross-entropy of accumulated opacity in the sky (Street Gaussians: 0.05).
+        sky: cross-entropy of accumulated opacity, 0 in the sky and 1 below the horizon (Street
+            Gaussians: 0.05).
         object_entropy: entropy of the objects' opacity inside their projected boxes, and their
             opacity outside (Street Gaussians: 0.1).
         box: distance of object Gaussians outside their box [m].
@@ -162,10 +163,13 @@ def lidar_depth(depth: Tensor, pixels: Tensor, measured: Tensor) -> Tensor:
 
 
 def sky_opacity(alpha: Tensor, sky: Tensor) -> Tensor:
-    """``-log(1 - alpha)``, weighted by ``sky`` and averaged over all pixels; both [H, W]."""
+    """``-log(1 - alpha)`` where ``sky`` is positive and ``-log(alpha)`` where it is negative,
+    weighted by its absolute value and averaged over all pixels; both [H, W].
+    """
     # Rendering stops at a transmittance of 1e-4, so that even an opaque wall keeps its gradient.
-    bounded = alpha.clamp(max=1 - 1e-5)
-    return (sky * -torch.log1p(-bounded)).mean()
+    in_sky = sky.clamp(min=0) * torch.log1p(-alpha.clamp(max=1 - 1e-5))
+    below = (-sky).clamp(min=0) * alpha.clamp(min=1e-3).log()
+    return -(in_sky + below).mean()
 
 
 def object_accumulation(alpha: Tensor, inside: Tensor) -> Tensor:

@@ -6,6 +6,7 @@ import pytest
 from real2sim_server.reconstruct.initialise.views import ProjectedView, SkySamples
 from real2sim_server.scene import Camera
 from real2sim_server.scene.camera import T_VEHICLE_OPTICAL
+from real2sim_server.scene.scene import face_directions
 
 WHITE, TREE = 250, 30
 CAMERA = Camera(
@@ -42,3 +43,17 @@ def test_without_a_mask_uncovered_pixels_are_sampled():
     samples.add(view(WHITE, covered=True), NONE)
     samples.add(view(TREE), NONE)
     assert ahead(samples) == pytest.approx(TREE, abs=1)
+
+
+def test_unseen_directions_continue_the_sky_and_not_what_stands_before_it():
+    samples = SkySamples(16)
+    rows = np.arange(64)[:, None]
+    horizon = np.where(rows < 24, WHITE, TREE) + np.zeros((1, 64))
+    looking = view(WHITE)
+    looking.image[:] = horizon[..., None]
+    samples.add(looking, horizon == WHITE)
+    faces = samples.finish(np.zeros(3, np.float32)).faces
+    low = face_directions(16)[..., 2]
+    beside = np.abs(face_directions(16)[..., 0]) < 0.5
+    unseen = faces.numpy()[beside & (low > 0.05)]
+    assert np.allclose(unseen * 255, WHITE, atol=2)

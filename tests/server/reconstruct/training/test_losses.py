@@ -41,6 +41,14 @@ def test_sky_opacity_loss_has_gradients_up_to_full_opacity():
     np.testing.assert_allclose(alpha.grad.numpy(), expected, rtol=1e-3)
 
 
+def test_sky_opacity_loss_closes_what_is_below_the_horizon():
+    alpha = torch.tensor([[0.25, 1 - 1e-4]], requires_grad=True)
+    loss = losses.sky_opacity(alpha, torch.tensor([[-1.0, -1.0]]))
+    assert float(loss.detach()) == pytest.approx(np.log(4) / 2, rel=1e-3)
+    loss.backward()
+    np.testing.assert_allclose(alpha.grad.numpy(), [[-2, -0.5]], rtol=1e-3)
+
+
 @pytest.mark.parametrize("fraction", [0.0, 0.2, 1.0])
 def test_photometric_loss_and_gradient_match_torch(pictures, fraction):
     image, truth = pictures

@@ -142,7 +142,10 @@ def test_views_have_a_sky_mask_only_for_the_sky_loss(tiny_log):
         sky, half = (views.view(index, divisor).sky for divisor in (1, 2))
         assert sky.shape == (64, 96)
         assert half.shape == (32, 48)
-        assert 0.02 < float(half.float().mean()) <= float(sky.float().mean()) < 0.4
+        assert 0.02 < float((half > 0).float().mean()) <= float((sky > 0).float().mean()) < 0.4
+        assert (sky[:32] >= 0).all()
+        assert (sky[36:] == -1).all()
+        assert (half[18:] == -1).all()
     without = replace(TINY, losses=replace(TINY.losses, sky=0.0))
     assert TrainingViews(tiny_log, [0], without).view(0).sky is None
 
