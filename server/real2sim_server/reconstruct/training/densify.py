@@ -18,6 +18,11 @@ from .gaussians import FIELDS, OBJECT_FIELDS, Gaussians
 # Sparse Adam: only rows with gradients are updated.
 
 EPSILON = 1e-15
+JOINT = ("means", "log_scales")
+"""Parameters whose columns share a second moment, so that a step has the direction of the gradient
+(Ling et al. 2022). Otherwise, every axis moves at the full rate, also along rays, where images give
+almost no gradient.
+"""
 
 
 class SelectiveAdam:
@@ -62,7 +67,7 @@ class SelectiveAdam:
         rate: float | Tensor,
         seen: Tensor | None,
     ) -> None:
-        rows = parameter.shape[0]
+        rows, joint = parameter.shape[0], name in JOINT
         views = [
             t.detach().reshape(rows, -1)
             for t in (parameter, gradient, self.first[name], self.second[name])
@@ -73,7 +78,7 @@ class SelectiveAdam:
         if seen is None:
             seen = torch.ones(rows, dtype=torch.bool, device=parameter.device)
         if parameter.device.type != "cpu":
-            _update_plain(views, seen, columns, correction)
+            _update_plain(views, seen, columns, correction, joint=joint)
             return
         values, by_values, first, second = (view.numpy() for view in views)
         kernels.adam_rows(
@@ -85,6 +90,7 @@ class SelectiveAdam:
             columns.contiguous().numpy(),
             np.float32(correction),
             np.float32(EPSILON),
+            joint,
         )
 
     def gather(self, name: str, source: Tensor, fresh: Tensor) -> None:
@@ -118,12 +124,17 @@ class SelectiveAdam:
         self.second = {k: state.get(f"second.{k}", held) for k, held in self.second.items()}
 
 
-def _update_plain(views: list[Tensor], seen: Tensor, columns: Tensor, correction: float) -> None:
+def _update_plain(
+    views: list[Tensor], seen: Tensor, columns: Tensor, correction: float, *, joint: bool
+) -> None:
     values, gradient, first, second = views
+    squares = gradient * gradient
+    if joint:
+        squares = squares.mean(1, keepdim=True)
     # torch.where avoids the device synchronisation of a boolean index.
     rows = seen[:, None]
     m = torch.where(rows, 0.9 * first + 0.1 * gradient, first)
-    v = torch.where(rows, 0.999 * second + 0.001 * gradient * gradient, second)
+    v = torch.where(rows, 0.999 * second + 0.001 * squares, second)
     first.copy_(m)
     second.copy_(v)
     values.sub_(torch.where(rows, columns * m / (v.sqrt() * correction + EPSILON), 0.0))

@@ -103,10 +103,11 @@ BETA2 = np.float32(0.999)
 
 
 @kernel(nogil=True, parallel=True, fastmath={"contract"})
-def adam_rows(values, gradient, first, second, seen, rates, correction, epsilon):
+def adam_rows(values, gradient, first, second, seen, rates, correction, epsilon, joint):
     """Update ``values``, ``first`` and ``second`` [N, P] float32 in place.
 
     Args:
+        joint: whether the columns of a row share the mean of their squares as second moment.
         gradient: [N, P] float32.
         seen: [N] bool, rows that take part.
         rates: [P] float32, learning rate of each column.
@@ -118,10 +119,16 @@ def adam_rows(values, gradient, first, second, seen, rates, correction, epsilon)
         for i in range(chunk * CHUNK, min(count, (chunk + 1) * CHUNK)):
             if not seen[i]:
                 continue
+            squares = np.float32(0.0)
+            if joint:
+                for j in range(width):
+                    squares += gradient[i, j] * gradient[i, j]
+                squares /= np.float32(width)
             for j in range(width):
                 g = gradient[i, j]
+                square = squares if joint else g * g
                 m = BETA1 * first[i, j] + (np.float32(1.0) - BETA1) * g
-                v = BETA2 * second[i, j] + (np.float32(1.0) - BETA2) * g * g
+                v = BETA2 * second[i, j] + (np.float32(1.0) - BETA2) * square
                 first[i, j] = m
                 second[i, j] = v
                 values[i, j] -= rates[j] * m / (np.sqrt(v) * correction + epsilon)

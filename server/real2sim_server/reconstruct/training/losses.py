@@ -41,7 +41,7 @@ class LossWeights:
 
     ssim: float = 0.2
     depth: float = 0.01
-    sky: float = 0.2
+    sky: float = 0.4
     object_entropy: float = 0.0
     box: float = 0.1
     needle: float = 0.01
