@@ -119,6 +119,12 @@ def quaternion_yaw(quaternion: ArrayLike) -> Float:
     return np.arctan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)
 
 
+def wrapped(angle: ArrayLike) -> Float:
+    """Angles [rad] wrapped to [-pi, pi)."""
+    turned: Float = (np.asarray(angle, dtype=np.float64) + np.pi) % (2 * np.pi) - np.pi
+    return turned
+
+
 def is_rotation(matrix: ArrayLike, *, tolerance: float = 1e-3) -> bool:
     """Whether a [3, 3] matrix is finite, orthonormal and right-handed within ``tolerance``."""
     m = np.asarray(matrix, dtype=np.float64)

@@ -50,7 +50,7 @@ SceneBundle = Annotated[
     Path, typer.Argument(help="Scene bundle, packed scene (.r2s.zip) or demo_street.")
 ]
 DrivingLogPath = Annotated[
-    Path, typer.Argument(help="Driving log: a folder, or the file of a drive that is one file.")
+    Path, typer.Argument(help="Driving log: a folder, or a single file (.tfrecord).")
 ]
 LogFormat = Annotated[
     str | None, typer.Option("--format", help="Format of the log; default: detected.")

@@ -14,7 +14,7 @@ from real2sim_proto import ErrorCode
 from real2sim_proto.operations import Operation, subject_of
 from real2sim_proto.scenarios import EditWarning
 
-from ..geometry import box_corners, first_overlap
+from ..geometry import box_corners, first_overlap, wrapped
 from ..scene import Ground, SceneError, Trajectory
 from . import lifecycle, motion
 from .appearance import AWAY
@@ -38,8 +38,8 @@ SLIP, SLIP_STEPS, MOVING = np.radians(20), 5, 1.0
 this many samples more than in the recording. Slower objects [m/s] count as stationary.
 """
 
-LEAST_SEEN = 0.6
-"""Surfaces of which images saw a smaller share are reported."""
+MIN_SEEN = 0.6
+"""Surfaces of which images saw a smaller share get a warning."""
 
 TURNED = np.radians(30)
 """An object turned by more than this against the recorded drive shows other sides [rad]."""
@@ -233,21 +233,18 @@ def _unseen_sides(
     own: Float,
 ) -> Iterator[EditWarning]:
     coverage = state.coverage
-    if (
-        coverage is None
-        or recorded is None
-        or subject.category in lifecycle.PEOPLE
-        or not subject.edited
-    ):
+    if coverage is None or recorded is None or not subject.edited:
+        return
+    if subject.category in lifecycle.PEOPLE:
         return
     track = recorded.trajectory
     theirs, _ = _sampled(track, track.start_us, track.end_us)
     usual = _drive_seen_from(recorded, theirs, track.start_us, track.end_us, coverage.ego)
     azimuth = _drive_seen_from(subject, own, int(times[0]), int(times[-1]), coverage.ego)
-    if usual is None or azimuth is None or abs(_wrapped(azimuth - usual)) <= TURNED:
+    if usual is None or azimuth is None or abs(wrapped(azimuth - usual)) <= TURNED:
         return
     share = coverage.of_side(subject.source_id, azimuth)
-    if share < LEAST_SEEN:
+    if share < MIN_SEEN:
         yield EditWarning(
             code="unseen_sides",
             object_id=subject.object_id,
@@ -260,9 +257,10 @@ def _unseen_sides(
 def _drive_seen_from(
     subject: ObjectState, transforms: Float, start_us: int, end_us: int, ego: Trajectory
 ) -> float | None:
-    """Azimuth of the nearest point of the recorded drive in the object's frame [rad].
+    """Azimuth [rad], in the object's frame, of the recording vehicle where it is nearest.
 
-    For a moving object, of the vehicle when it is nearest; None if they never exist together.
+    A standing object is compared with the whole drive, a moving one at the same times; None if they
+    have none in common.
     """
     if subject.standing:
         transforms, there = transforms[:1], ego.positions
@@ -277,10 +275,6 @@ def _drive_seen_from(
     # Scaling an axis turns its normals the other way.
     x, y = ways[nearest] @ pose[:2, :2] / subject.scale[:2]
     return float(np.arctan2(y, x))
-
-
-def _wrapped(angle: float) -> float:
-    return float((angle + np.pi) % (2 * np.pi) - np.pi)
 
 
 def _uncovered_ground(subject: ObjectState, state: ScenarioState) -> Iterator[EditWarning]:
@@ -299,7 +293,7 @@ def _uncovered_ground(subject: ObjectState, state: ScenarioState) -> Iterator[Ed
         if np.linalg.norm(pose[:2, 3] - footprints[-1][:2, 3]) > AWAY:
             footprints.append(pose)
     share = coverage.of_ground(subject.object_id, footprints, recorded.size)
-    if share < LEAST_SEEN:
+    if share < MIN_SEEN:
         yield EditWarning(
             code="unseen_ground",
             object_id=subject.object_id,

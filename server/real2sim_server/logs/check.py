@@ -257,7 +257,7 @@ MANY_OFF = 0.3
 """Minimum fraction of misaligned vehicles for a hint; a few may drive backwards."""
 DRIVEN_STEP_M = 0.3
 """Minimum distance of two poses for a direction of motion."""
-LEAST_DRIVEN_M = 1.0
+MIN_DRIVEN_M = 1.0
 """Minimum length of a drive for depths from images alone [m]."""
 MIN_UP = 0.3
 """Minimum z component of an axis that should point up."""
@@ -326,7 +326,7 @@ def _images_alone(log: DrivingLog) -> list[str]:
         "there is no LiDAR: reconstruct takes depths from features that images have in common; "
         "track and fit-lidar need LiDAR"
     ]
-    if driven < LEAST_DRIVEN_M:
+    if driven < MIN_DRIVEN_M:
         found.append(
             f"the ego drives {driven:.1f} m: without LiDAR, depths need images from several places"
         )

@@ -19,7 +19,7 @@ def open_log(
 
     Args:
         path: the log's folder, or one up to two levels above it that contains no other log, such
-            as the folder of an exported data set; or the file of a drive that is one file.
+            as the folder of an exported data set; or the file of a log that is a single file.
         format: a reader's name; by default the first reader that recognises the path.
         sequence: name of a drive in a folder with several; a single one is the default.
 
@@ -29,8 +29,8 @@ def open_log(
     given = Path(path)
     if not given.exists():
         raise LogError(
-            f"{given}: no such file or folder; give the folder of a log, or the file of a drive "
-            f"that is one file\n{_known_formats()}"
+            f"{given}: no such file or folder; give the folder of a log, or the file of a log "
+            f"that is a single file\n{_known_formats()}"
         )
     found, reader = _reader_for(given, format)
     with damage_named(f"{found} ({reader.name})"):

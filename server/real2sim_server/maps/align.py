@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..geometry import Float
+from ..geometry import Float, wrapped
 from ..scene import Ground, LaneGraph, Scene, Trajectory
 from .reader import MapError
 
@@ -188,7 +188,7 @@ def _measured(graph: LaneGraph, poses: Float, motion: Float) -> Alignment:
         along = np.cos(heading - lane.at(s)[3]) > 0.7
         inside.append(bool(along and abs(offset) <= lane.width(s) / 2))
     residual = float(np.median(np.abs(np.where(index >= 0, values[:, 1], 1e6))))
-    yaw = (motion[0] + np.pi) % (2 * np.pi) - np.pi
+    yaw = wrapped(motion[0])
     return Alignment(
         float(yaw), float(motion[1]), float(motion[2]), residual, float(np.mean(inside))
     )

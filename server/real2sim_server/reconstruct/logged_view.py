@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,12 +13,20 @@ from ..geometry import Float, apply_transform, box_corners, invert_transform
 from ..logs import DrivingLog, LidarSweep, ObjectTrack
 from ..scene import Camera, Scene
 
+T = TypeVar("T")
+
 # Image time, and LiDAR points and objects in an image.
 
 NEAR = 0.2
 """Boxes are cut off at this depth in front of the camera [m]."""
 EDGES = np.array([(a, a | bit) for bit in (1, 2, 4) for a in range(8) if not a & bit])
 """[12, 2] corners at the ends of each edge of a box, in the order of ``box_corners``."""
+
+
+def spread(items: Sequence[T], limit: int) -> list[T]:
+    """At most ``limit`` of ``items``, evenly spread, including the first and the last."""
+    places = np.linspace(0, len(items) - 1, min(limit, len(items)))
+    return [items[round(place)] for place in places]
 
 
 def image_time(log: DrivingLog, camera: str, frame: int) -> int:

@@ -44,23 +44,22 @@ class Coverage:
     background: GaussianCloud
     objects: Mapping[str, GaussianCloud]
     ego: Trajectory
-    _sides: dict[str, Float] = field(default_factory=dict, repr=False)
-    _grounds: dict[str, float] = field(default_factory=dict, repr=False)
+    _sides: dict[str, Float] = field(default_factory=dict, init=False, repr=False)
+    _grounds: dict[str, float] = field(default_factory=dict, init=False, repr=False)
 
     def of_side(self, object_id: str, azimuth: float) -> float:
-        """Share in [0, 1] of the surface seen by images, of what faces ``azimuth`` [rad] in the
-        object's frame; nan if nothing does or if it is unknown.
+        """Share in [0, 1] that images saw of the surface towards ``azimuth`` [rad] in the object's
+        frame; nan if there is none or if it is unknown.
         """
-        shares = self._sides.get(object_id)
-        if shares is None:
-            cloud = self.objects.get(object_id)
-            shares = self._sides[object_id] = _side_shares(cloud)
-        return float(shares[round(azimuth / (2 * np.pi) * AZIMUTHS) % AZIMUTHS])
+        if object_id not in self._sides:
+            self._sides[object_id] = _side_shares(self.objects.get(object_id))
+        place = round(azimuth / (2 * np.pi) * AZIMUTHS) % AZIMUTHS
+        return float(self._sides[object_id][place])
 
     def of_ground(
         self, object_id: str, poses: Iterable[Float], size: tuple[float, float, float]
     ) -> float:
-        """Share in [0, 1] of the ground below an object seen by images; nan without any.
+        """Share in [0, 1] that images saw of the ground below an object; nan without any.
 
         Args:
             object_id: key of the cached share.

@@ -29,7 +29,7 @@ from real2sim_proto.sensors import (
 )
 
 from .._files import read_text
-from ..geometry import Float, is_rigid
+from ..geometry import Float, is_rigid, wrapped
 from .errors import LidarError, RadarError
 
 MAX_SLOTS = 2048
@@ -250,12 +250,6 @@ class Lidar:
     def placed(self, T_vehicle_lidar: ArrayLike) -> Lidar:
         """The same sensor at another pose on the vehicle."""
         return replace(self, T_vehicle_lidar=np.asarray(T_vehicle_lidar, dtype=np.float64))
-
-
-def wrapped(angle: Float) -> Float:
-    """Angles [rad] wrapped to [-pi, pi)."""
-    turned: Float = (np.asarray(angle, dtype=np.float64) + np.pi) % (2 * np.pi) - np.pi
-    return turned
 
 
 def _check_range(what: str, value: float, low: float, high: float) -> None:

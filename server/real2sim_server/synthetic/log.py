@@ -102,9 +102,10 @@ class SyntheticLog(DrivingLog):
         )
 
     def with_vehicles(self, changed: Mapping[str, Trajectory | None]) -> SyntheticLog:
-        """The drive on the same street with other traffic.
+        """The drive on the same street with other traffic; people keep their ways.
 
-        No config describes it, so its provenance has none.
+        No config describes it, so its provenance has none. For a single view without people, see
+        :meth:`render_placed`.
 
         Args:
             changed: new trajectories of vehicles by id, None to remove one.

@@ -24,7 +24,7 @@ from real2sim.cli import build_app
 from real2sim_server.datasets.clips import POINT, Clip
 from real2sim_server.datasets.writers import WRITERS
 from real2sim_server.datasets.writers.categories import CATEGORIES
-from real2sim_server.datasets.writers.kitti import VELODYNE, share, write_scans
+from real2sim_server.datasets.writers.kitti import VELODYNE, link_or_copy, write_scans
 from real2sim_server.logs import LogError, open_log
 from real2sim_server.logs.readers.common import compensate_sweep
 from real2sim_server.scene.io import save_scene
@@ -209,7 +209,7 @@ def test_kitti_scans_are_copied_where_links_are_refused(tmp_path, monkeypatch):
 
     monkeypatch.setattr("os.link", refuse)
     (tmp_path / "one").write_bytes(b"scan")
-    share(tmp_path / "one", tmp_path / "there" / "two")
+    link_or_copy(tmp_path / "one", tmp_path / "there" / "two")
     assert (tmp_path / "there" / "two").read_bytes() == b"scan"
 
 

@@ -16,7 +16,7 @@ from xml.sax.saxutils import escape
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry import Float, invert_transform
+from ...geometry import Float, invert_transform, wrapped
 from ...logs.readers.common import compensate_sweep
 from ...scene import Camera
 from ..clips import Clip
@@ -30,15 +30,15 @@ OCCLUDED = (0.85, 0.45)
 """Minimum visibility of fully (0) and partly (1) visible objects; below it is 2."""
 
 VELODYNE = (0.9, 0.0, 1.73)
-"""Position of the scanner in the ego frame [m], at KITTI's height above the road. Its axes are the
-ego's, so that the sequences of all cameras have the same scans."""
+"""Position of the scanner in the ego frame [m], at KITTI's height above the road. It has the axes
+of the ego, so that the sequences of all cameras have the same scans."""
 
 T_EGO_VELO = np.eye(4)
 T_EGO_VELO[:3, 3] = VELODYNE
 
 ROUNDS, SETTLED = 8, 1e-4
-"""Maximum number of iterations to invert the motion compensation of a point, and the size of the
-last step [m]."""
+"""Maximum number of iterations to invert the motion compensation of a point, and maximum size of
+the last step of a point that is kept [m]."""
 
 
 class KittiWriter:
@@ -67,9 +67,9 @@ class KittiWriter:
         write_json(folder / "sequences.json", sequences)
 
 
-def share(source: Path, target: Path) -> None:
-    """Give a file a second name, so that it is stored once; a copy where the file system refuses
-    hard links."""
+def link_or_copy(source: Path, target: Path) -> None:
+    """Make a hard link to a file, which stores it once; a copy where the file system refuses
+    links."""
     target.parent.mkdir(parents=True, exist_ok=True)
     try:
         os.link(source, target)
@@ -83,8 +83,8 @@ def _write_sequence(
     tracks = _track_numbers(clip)
     seen, all_around = [], []
     for k, frame in enumerate(clip.frames):
-        share(clip.file("rgb", camera.name, k), root / "image_02" / name / f"{k:06d}.png")
-        share(scans[k], root / "velodyne" / name / f"{k:06d}.bin")
+        link_or_copy(clip.file("rgb", camera.name, k), root / "image_02" / name / f"{k:06d}.png")
+        link_or_copy(scans[k], root / "velodyne" / name / f"{k:06d}.bin")
         for row in _seen_rows(frame, camera):
             seen.append(f"{k} {tracks[row['object_id']]} {_columns(row)}")
         for row in _all_rows(frame, camera):
@@ -109,8 +109,8 @@ def _write_object_frames(
     calibration = _calibration(camera, "R0_rect", "Tr_velo_to_cam")
     for k, frame in enumerate(clip.frames):
         name = f"{next(numbers):06d}"
-        share(clip.file("rgb", camera.name, k), root / "image_2" / f"{name}.png")
-        share(scans[k], root / "velodyne" / f"{name}.bin")
+        link_or_copy(clip.file("rgb", camera.name, k), root / "image_2" / f"{name}.png")
+        link_or_copy(scans[k], root / "velodyne" / f"{name}.bin")
         labels = [_columns(row) for row in _seen_rows(frame, camera)]
         _write_lines(root / "label_2" / f"{name}.txt", labels)
         _write_lines(root / "calib" / f"{name}.txt", calibration)
@@ -156,17 +156,13 @@ def _columns(row: Mapping[str, Any]) -> str:
     length, width, height = row["size"]
     x, y, z = pose[:3, 3].tolist()
     heading = math.atan2(-pose[2, 0], pose[0, 0])
-    alpha = _wrapped(heading - math.atan2(x, z))
+    alpha = float(wrapped(heading - math.atan2(x, z)))
     box = row["box_2d_modal"]
     pixels = [-1.0] * 4 if box is None else [max(edge - 0.5, 0.0) for edge in box]
     occluded = sum(row["visibility"] < least for least in OCCLUDED)
     values = [alpha, *pixels, height, width, length, x, y + height / 2, z, heading]
     kind = classes_of(row["category"]).kitti or MISC
     return f"{kind} {row['truncation']:.6f} {occluded} {numbers(values)}"
-
-
-def _wrapped(angle: float) -> float:
-    return (angle + math.pi) % (2 * math.pi) - math.pi
 
 
 def _calibration(camera: Camera, rectification: str, velo_to_cam: str) -> list[str]:
@@ -190,20 +186,21 @@ def write_scans(clip: Clip, folder: Path) -> list[Path]:
     paths = [folder / f"{k}.bin" for k in range(len(clip.frames))]
     for k, path in enumerate(paths):
         rows = clip.points(k)
-        points, met = _as_measured(rows["xyz"].astype(np.float64), poses, k)
+        points, measured = _as_measured(rows["xyz"].astype(np.float64), poses, k)
         scan = np.empty((len(rows), 4), "<f4")
         scan[:, :3] = points - VELODYNE
         scan[:, 3] = rows["intensity"]
-        path.write_bytes(scan[met].tobytes())
+        path.write_bytes(scan[measured].tobytes())
     return paths
 
 
 def _as_measured(points: Float, poses: Float, frame: int) -> tuple[Float, NDArray[np.bool_]]:
-    """Points [N, 3] of one instant, moved to the ego frame at their times of measurement; mask [N]
-    of those that the scan meets.
+    """Points [N, 3] of one instant, moved to the ego frame at their times of measurement, and a
+    mask [N] of those that the scanner can measure.
 
     The scanner turns clockwise once per frame and looks ahead at the frame's time. In a curve, it
-    misses a strip straight behind it."""
+    misses a strip straight behind it.
+    """
     measured, left = points.copy(), np.arange(len(points))
     for _ in range(ROUNDS):
         here = measured[left]
@@ -211,9 +208,9 @@ def _as_measured(points: Float, poses: Float, frame: int) -> tuple[Float, NDArra
         step = points[left] - compensate_sweep(here, offset, poses, frame)
         measured[left] = here + step
         left = left[np.abs(step).max(axis=1) > SETTLED]
-    met = np.ones(len(points), np.bool_)
-    met[left] = False
-    return measured, met
+    settled = np.ones(len(points), np.bool_)
+    settled[left] = False
+    return measured, settled
 
 
 def numbers(values: Any) -> str:
@@ -230,7 +227,7 @@ def _write_lines(path: Path, lines: Sequence[str]) -> None:
 
 # A drive for each clip and camera, with GPS/IMU records and tracklets. Source: Geiger et al.,
 # "Vision meets Robotics: The KITTI Dataset", IJRR 2013, and the raw data's development kit. Camera,
-# scanner and scans are as above. The GPS/IMU unit has the ego frame. Boxes rotate about the
+# scanner and scans are as above. The GPS/IMU frame is the ego frame. Boxes rotate about the
 # scanner's vertical axis only.
 
 DAY = "2011_09_26"
@@ -265,8 +262,8 @@ def _write_drive(folder: Path, clip: Clip, camera: Camera, scans: Sequence[Path]
         (folder / part / "timestamps.txt").write_text(stamps)
     for k, frame in enumerate(clip.frames):
         image = clip.file("rgb", camera.name, frame["index"])
-        share(image, folder / "image_02" / "data" / f"{k:010d}.png")
-        share(scans[k], folder / "velodyne_points" / "data" / f"{k:010d}.bin")
+        link_or_copy(image, folder / "image_02" / "data" / f"{k:010d}.png")
+        link_or_copy(scans[k], folder / "velodyne_points" / "data" / f"{k:010d}.bin")
         oxts = _oxts(np.array(frame["T_world_ego"]))
         (folder / "oxts" / "data" / f"{k:010d}.txt").write_text(oxts + "\n")
     _write_calibration(folder, camera)

@@ -18,9 +18,9 @@ from ...scene import Camera, Scene
 from ...synthetic import SyntheticLog
 from ...synthetic.street import KERB_HEIGHT
 from ...synthetic.vehicles import SHAPES
-from ..logged_view import image_time, tracks_mask
+from ..logged_view import image_time, spread, tracks_mask
 from .images import SEEN_WITHIN, is_seen, logged_azimuths, mean_psnr, psnr, ssim
-from .rendering import render_view, spread
+from .rendering import render_view
 from .shifted import MIN_OBJECT_PIXELS, within_an_object
 
 LANE_M = 3.5
@@ -41,6 +41,23 @@ CHANGED_MARGIN = 3
 """Changed regions are enlarged by this many pixels."""
 GROUND_ABOVE = 0.05
 """Surfaces up to this far above the pavement count as ground [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Cast:
+    """A ray-cast view of a street.
+
+    Attributes:
+        rgb: [H, W, 3].
+        depth: [H, W] along z [m], 0 in the sky.
+        instance: [H, W], 1 + index of the track, 0 elsewhere.
+        pose: ``T_world_camera`` [4, 4].
+    """
+
+    rgb: NDArray[np.uint8]
+    depth: NDArray[np.float32]
+    instance: NDArray[np.uint16]
+    pose: Float
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,12 +101,11 @@ class EditedView:
     seen: bool | None
 
 
-@dataclass(frozen=True)
-class EditViewScore:
-    """One view of an edit against the truth.
+@dataclass(frozen=True, kw_only=True)
+class EditFigures:
+    """Edited images against the truth.
 
     Attributes:
-        camera, frame: camera and frame of the view.
         psnr, ssim: over the region that the edit changes [dB], [1].
         pixels: number of its pixels.
         psnr_hidden_ground: over the ground that the edit reveals [dB]; nan below 50 pixels.
@@ -99,8 +115,6 @@ class EditViewScore:
             the log saw this side, and for deletions.
     """
 
-    camera: str
-    frame: int
     psnr: float
     ssim: float
     pixels: int
@@ -109,27 +123,28 @@ class EditViewScore:
     psnr_unseen: float
 
 
-@dataclass(frozen=True)
-class EditScore:
-    """One edit of one vehicle: means over its views, as in :class:`EditViewScore`.
+@dataclass(frozen=True, kw_only=True)
+class EditViewScore(EditFigures):
+    """One view of an edit, of ``camera`` at ``frame``."""
+
+    camera: str
+    frame: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class EditScore(EditFigures):
+    """One edit of one vehicle: means over its views, and the sum of their pixels.
 
     Attributes:
         object_id: id of the vehicle.
         vehicle: ``parked``, ``passing`` (moves, seen from several sides) or ``followed`` (moves,
             only seen from behind).
         edit: a name in :func:`edits_of`.
-        pixels: sum over the views.
     """
 
     object_id: str
     vehicle: str
     edit: str
-    psnr: float
-    ssim: float
-    pixels: int
-    psnr_hidden_ground: float
-    psnr_shadows: float
-    psnr_unseen: float
     views: tuple[EditViewScore, ...]
 
 
@@ -147,7 +162,7 @@ def evaluate_edits(
     pairs: Sequence[tuple[Camera, int]],
     *,
     backend: str = "auto",
-    on_view: Callable[[int, int], None] | None = None,
+    on_edit: Callable[[int, int], None] | None = None,
 ) -> tuple[EditScore, ...]:
     """Edit up to three vehicles and compare with the street that has the same edit.
 
@@ -156,11 +171,13 @@ def evaluate_edits(
         log: gives the times of the frames.
         truth: street of ``log``.
         pairs: compared cameras, at the compared size, and frames.
-        on_view: called with the number of finished edits and of all edits.
+        on_edit: called with the number of finished edits and of all edits.
     """
     frames = set(spread(sorted({frame for _, frame in pairs}), MAX_FRAMES))
     pairs = [(camera, frame) for camera, frame in pairs if frame in frames]
-    visible = [_pixels(truth, camera, image_time(log, camera.name, f)) for camera, f in pairs]
+    casts = [cast(truth, camera, image_time(log, camera.name, f)) for camera, f in pairs]
+    tracks = 1 + len(truth.tracks)
+    visible = [np.bincount(c.instance.ravel(), minlength=tracks)[1:] for c in casts]
     chosen = choose_vehicles(scene, truth, np.array(visible))
     todo = [(kind, name, edit) for kind, name in chosen.items() for edit in edits_of(name)]
     scores = []
@@ -168,20 +185,20 @@ def evaluate_edits(
         edit = apply_edit(scene, truth, object_id, edits_of(object_id)[name])
         index = _ids(truth).index(object_id)
         shown = [
-            (camera, frame)
-            for pixels, (camera, frame) in zip(visible, pairs, strict=True)
+            (camera, frame, before)
+            for pixels, (camera, frame), before in zip(visible, pairs, casts, strict=True)
             if _is_shown(scene, edit, camera, image_time(log, camera.name, frame), pixels[index])
         ]
         views = []
-        for camera, frame in spread(shown, MAX_VIEWS):
+        for camera, frame, before in spread(shown, MAX_VIEWS):
             t_us = image_time(log, camera.name, frame)
-            view = compare_edit(scene, edit, camera, t_us, backend=backend)
+            view = compare_edit(scene, edit, camera, t_us, before=before, backend=backend)
             if (view.region & ~view.shadows).sum() >= MIN_PIXELS:
                 views.append(score_view(view, camera.name, frame))
         if views:
             scores.append(_mean(object_id, kind, name, views))
-        if on_view is not None:
-            on_view(done + 1, len(todo))
+        if on_edit is not None:
+            on_edit(done + 1, len(todo))
     return tuple(scores)
 
 
@@ -225,33 +242,47 @@ def apply_edit(
     return AppliedEdit(object_id, edited, truth, after)
 
 
+def cast(street: SyntheticLog, camera: Camera, t_us: int) -> Cast:
+    """Cast a view from the recording vehicle at ``t_us`` [us]."""
+    pose = camera.pose(street.ego.transform(t_us))
+    return Cast(*street.render(pose, camera.K, camera.width, camera.height, t_us), pose)
+
+
 def compare_edit(
-    scene: Scene, edit: AppliedEdit, camera: Camera, t_us: int, *, backend: str = "auto"
+    scene: Scene,
+    edit: AppliedEdit,
+    camera: Camera,
+    t_us: int,
+    *,
+    before: Cast | None = None,
+    backend: str = "auto",
 ) -> EditedView:
-    """Render the edited scene and the street from the recording vehicle at ``t_us`` [us]."""
-    pose = camera.pose(edit.before.ego.transform(t_us))
-    size = (camera.width, camera.height)
-    before, _, instance = edit.before.render(pose, camera.K, *size, t_us)
-    after, depth, instance_after = edit.after.render(pose, camera.K, *size, t_us)
-    old = instance == 1 + _ids(edit.before).index(edit.object_id)
+    """Render the edited scene and the street from the recording vehicle at ``t_us`` [us].
+
+    Args:
+        before: the view of the street without the edit; None casts it.
+    """
+    before = before or cast(edit.before, camera, t_us)
+    after = cast(edit.after, camera, t_us)
+    old = before.instance == 1 + _ids(edit.before).index(edit.object_id)
     new, seen = np.zeros_like(old), None
     if edit.object_id in _ids(edit.after):
         index = _ids(edit.after).index(edit.object_id)
-        new = instance_after == 1 + index
+        new = after.instance == 1 + index
         track = edit.before.tracks[_ids(edit.before).index(edit.object_id)]
         T_world_object = edit.after.tracks[index].trajectory.transform(t_us)
-        x, y, _ = (invert_transform(T_world_object) @ pose)[:3, 3]
+        x, y, _ = (invert_transform(T_world_object) @ after.pose)[:3, 3]
         seen = is_seen(float(np.arctan2(y, x)), logged_azimuths(edit.before, track))
-    region = edit_region(before, after, old | new)
+    region = edit_region(before.rgb, after.rgb, old | new)
     instances = instances_at(scene, edit.state, t_us)
     return EditedView(
         rendered=render_view(scene, camera, t_us, instances=instances, backend=backend).rgb,
-        before=before,
-        after=after,
+        before=before.rgb,
+        after=after.rgb,
         region=region,
         shadows=region & ~old & ~new,
         vehicle=new,
-        hidden_ground=old & (instance_after == 0) & _ground(depth, camera, pose),
+        hidden_ground=old & (after.instance == 0) & _ground(after, camera),
         seen=seen,
     )
 
@@ -292,13 +323,6 @@ def _ids(log: DrivingLog) -> list[str]:
     return [track.object_id for track in log.tracks]
 
 
-def _pixels(truth: SyntheticLog, camera: Camera, t_us: int) -> NDArray[np.int64]:
-    """Number of visible pixels of each track [tracks]."""
-    pose = camera.pose(truth.ego.transform(t_us))
-    _, _, instance = truth.render(pose, camera.K, camera.width, camera.height, t_us)
-    return np.bincount(instance.ravel(), minlength=1 + len(truth.tracks))[1:]
-
-
 def _kind(truth: SyntheticLog, track: ObjectTrack) -> str | None:
     if not track.trajectory.moves:
         return "parked"
@@ -327,12 +351,12 @@ def _is_shown(scene: Scene, edit: AppliedEdit, camera: Camera, t_us: int, old_pi
     return bool(max(old_pixels, tracks_mask(moved, camera, pose, t_us).sum()) >= MIN_PIXELS)
 
 
-def _ground(depth: NDArray[np.float32], camera: Camera, T_world_camera: Float) -> NDArray[np.bool_]:
+def _ground(view: Cast, camera: Camera) -> NDArray[np.bool_]:
     """Pixels [H, W] with a surface at the height of the road or the pavement."""
     v, u = np.mgrid[: camera.height, : camera.width] + 0.5
     rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(camera.K).T
-    height = T_world_camera[2, 3] + depth * (rays @ T_world_camera[2, :3])
-    return np.asarray((depth > 0) & (height <= KERB_HEIGHT + GROUND_ABOVE))
+    height = view.pose[2, 3] + view.depth * (rays @ view.pose[2, :3])
+    return np.asarray((view.depth > 0) & (height <= KERB_HEIGHT + GROUND_ABOVE))
 
 
 def _mean(object_id: str, vehicle: str, edit: str, views: Sequence[EditViewScore]) -> EditScore:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry import Float, invert_transform
+from ...geometry import Float, invert_transform, wrapped
 from ...logs import DrivingLog, ObjectTrack
 from ...render import Instance, RasterOptions, rasterize
 from ...scene import Camera, Scene
@@ -270,8 +270,7 @@ def _sides(
 
 def is_seen(azimuth: float, logged_from: Sequence[float]) -> bool:
     """Whether a side was seen: within SEEN_WITHIN of one of :func:`logged_azimuths`."""
-    offsets = (np.array(logged_from) - azimuth + np.pi) % (2 * np.pi) - np.pi
-    return bool((np.abs(offsets) <= SEEN_WITHIN).any())
+    return bool((np.abs(wrapped(np.array(logged_from) - azimuth)) <= SEEN_WITHIN).any())
 
 
 def _mean(values: Sequence[float]) -> float:

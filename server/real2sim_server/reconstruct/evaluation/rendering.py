@@ -6,7 +6,6 @@ import statistics
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +17,6 @@ from ...scene import Camera, Scene
 from ..logged_view import image_time
 from ..options import ReconstructError
 from ..training.data import held_out_frames
-
-T = TypeVar("T")
 
 # Rendered views at recorded and shifted poses, and their frame rate.
 
@@ -216,12 +213,6 @@ def select_cameras(scene: Scene, log: DrivingLog, width: int | None) -> tuple[Ca
             f"{log.name!r}; evaluate it on the log it was made of"
         )
     return tuple(scene.rig[camera.name].resized(width or camera.width) for camera in log.rig)
-
-
-def spread(items: Sequence[T], limit: int) -> list[T]:
-    """At most ``limit`` of ``items``, evenly spread, in order."""
-    places = np.linspace(0, len(items) - 1, min(limit, len(items)))
-    return [items[i] for i in sorted({round(p) for p in places})]
 
 
 def listed_held_out(scene: Scene) -> list[int]:

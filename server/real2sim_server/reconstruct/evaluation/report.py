@@ -18,10 +18,10 @@ from ...logs import DrivingLog, same_part
 from ...render import Frame, encode_rgb
 from ...render.frame import uncertainty_picture
 from ...scene import Camera, Scene
-from ..logged_view import box_outline, image_time, moving_tracks
+from ..logged_view import box_outline, image_time, moving_tracks, spread
 from .edits import EditScore, apply_edit, compare_edit, edits_of
 from .images import Truth, find_truth
-from .rendering import render_uncertainty, render_view, select_cameras, spread
+from .rendering import render_uncertainty, render_view, select_cameras
 from .scores import CameraScore, EvaluateOptions, Evaluation, logged_pair
 from .shifted import true_view
 

@@ -13,7 +13,14 @@ from ...logs import DrivingLog, same_part
 from ...render import Frame
 from ...scene import Camera, Scene
 from ...synthetic import SyntheticLog
-from ..logged_view import image_time, moving_tracks, points_in_camera, resized, tracks_mask
+from ..logged_view import (
+    image_time,
+    moving_tracks,
+    points_in_camera,
+    resized,
+    spread,
+    tracks_mask,
+)
 from ..options import OnProgress, ReconstructError, ReportStep, Stages
 from .edits import EditScore, evaluate_edits
 from .images import PSNR_CAP, AroundScore, evaluate_around, find_truth, mean_psnr, psnr, ssim
@@ -67,7 +74,7 @@ class EvaluateOptions:
         shifted_frames: maximum number of frames rendered from shifted poses, evenly spread.
         repeats: timed renders.
         backend: backend of the renderer.
-        around: whether to render vehicles from all sides, if truth exists.
+        around: whether to render vehicles from all sides; needs truth.
         edits: whether to edit vehicles and compare with the street that has the same edits; needs
             truth.
         lidar: whether to cast and compare LiDAR sweeps, if the log has any.
@@ -162,7 +169,7 @@ class Evaluation:
         shifted: views shifted from the path; empty without truth.
         no_shifted: the reason why it is empty; empty otherwise.
         lane_band: the road seen from shifted poses, against its appearance in other images.
-        around: vehicles from all sides; None unless requested, or without truth.
+        around: vehicles from all sides; None unless requested.
         edits: edited vehicles against the truth; None unless requested, empty if no compared frame
             shows one.
         lidar: sweeps against the measured or true ones; None unless requested, or without sweeps.
@@ -222,8 +229,8 @@ def evaluate_scene(
     scene made of a part of the log, only that part is used, and its frames count from 0.
 
     Raises:
-        ReconstructError: the scene and the log do not belong together, no frame is left, or edits
-            of a log without truth are requested.
+        ReconstructError: the scene and the log do not belong together, no frame is left, or the
+            log lacks the truth that ``around`` and ``edits`` need.
         LogError: images or sweeps that cannot be read.
     """
     options = options or EvaluateOptions()
@@ -240,7 +247,7 @@ def evaluate_scene(
     ]
     if not pairs:
         raise ReconstructError(f"log {log.name!r} has no image at frames {list(chosen.frames)}")
-    street = _required_truth(log) if options.edits else None
+    street = _required_truth(log) if options.around or options.edits else None
     views, errors = [], []
     with stages("views") as report_step:
         for done, (camera, frame) in enumerate(pairs):
@@ -257,13 +264,14 @@ def evaluate_scene(
         )
     with stages("lane_band"):
         lane_band = _lane_band(scene, log, cameras[0], chosen.frames, options)
-    with stages("around"):
-        around = _around(scene, log) if options.around else None
-    edits = None
-    if street is not None:
+    around, edits = None, None
+    if street is not None and options.around:
+        with stages("around"):
+            around = evaluate_around(scene, street)
+    if street is not None and options.edits:
         with stages("edits") as report_step:
             edits = evaluate_edits(
-                scene, log, street, pairs, backend=options.backend, on_view=report_step
+                scene, log, street, pairs, backend=options.backend, on_edit=report_step
             )
     with stages("uncertainty"):
         uncertainty = evaluate_uncertainty(scene, log, pairs, backend=options.backend)
@@ -351,13 +359,11 @@ def _shifted(
     truth = find_truth(log)
     if truth.log is None:
         return (), f"no ground truth exists off the recorded path: {truth.missing}"
-    count = min(options.shifted_frames, len(times_us))
-    chosen_times = sorted({round(i) for i in np.linspace(0, len(times_us) - 1, count)})
     scores = evaluate_shifts(
         scene,
         truth.log,
         cameras,
-        [times_us[i] for i in chosen_times],
+        spread(times_us, options.shifted_frames),
         options.shifts,
         backend=options.backend,
         on_view=report_step,
@@ -374,22 +380,16 @@ def _lane_band(
 ) -> tuple[LaneBandScore, ...]:
     if not options.shifts:
         return ()
-    count = min(options.shifted_frames, len(frames))
-    chosen = [frames[round(i)] for i in np.linspace(0, len(frames) - 1, count)]
+    chosen = spread(frames, options.shifted_frames)
     return evaluate_lane_band(scene, log, camera, chosen, options.shifts, backend=options.backend)
-
-
-def _around(scene: Scene, log: DrivingLog) -> AroundScore | None:
-    truth = find_truth(log).log
-    return None if truth is None else evaluate_around(scene, truth)
 
 
 def _required_truth(log: DrivingLog) -> SyntheticLog:
     truth = find_truth(log)
     if truth.log is None:
         raise ReconstructError(
-            f"edits are compared with a true street, which this log lacks: {truth.missing}; "
-            "evaluate without edits"
+            "views from all around and edits are compared with a true street, which this log "
+            f"lacks: {truth.missing}; evaluate without them"
         )
     return truth.log
 

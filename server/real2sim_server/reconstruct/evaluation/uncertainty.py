@@ -17,7 +17,7 @@ from ...render.backend import Backend
 from ...render.select import select_backend
 from ...scene import UNSEEN, Camera, Scene, Sky
 from ...scene.cloud import SH_C0
-from ..logged_view import image_time, resized
+from ..logged_view import image_time, resized, spread
 from ..options import ReconstructError
 from ..training.run import one_torch_thread
 from .rendering import (
@@ -267,8 +267,7 @@ def evaluate_uncertainty(
     """
     if not scene.has_uncertainties or not views:
         return None
-    count = min(MAX_VIEWS, len(views))
-    chosen = [views[round(i)] for i in np.linspace(0, len(views) - 1, count)]
+    chosen = spread(views, MAX_VIEWS)
     images = [_images(scene, log, camera, frame, backend) for camera, frame in chosen]
     regions = [(_smooth(uncertainty), _smooth(error)) for uncertainty, error in images]
     return UncertaintyScore(
@@ -277,7 +276,7 @@ def evaluate_uncertainty(
         sparsification=_mean(sparsification(u, e) for u, e in images),
         uncertainty=_mean(float(u.mean()) for u, _ in images),
         error=_mean(float(e.mean()) for _, e in images),
-        views=count,
+        views=len(chosen),
     )
 
 

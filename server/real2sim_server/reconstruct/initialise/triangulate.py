@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ...geometry import Float, apply_transform, invert_transform
 from ...logs import DrivingLog
 from ...scene import Camera
-from ..logged_view import resized, still_surfaces
+from ..logged_view import resized, spread, still_surfaces
 
 # Triangulation of features matched between known poses.
 
@@ -121,8 +121,7 @@ def spread_frames(log: DrivingLog, camera: Camera, limit: int) -> list[int]:
         if last is None or np.linalg.norm(centre - last) >= MIN_STEP:
             kept.append(frame)
             last = centre
-    picked = np.unique(np.linspace(0, len(kept) - 1, min(limit, len(kept))).round().astype(int))
-    return [kept[i] for i in picked]
+    return spread(kept, limit)
 
 
 def _pose(log: DrivingLog, camera: Camera, frame: int) -> Float:

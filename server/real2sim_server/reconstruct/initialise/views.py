@@ -17,6 +17,7 @@ from ...geometry import Float
 from ...logs import DrivingLog
 from ...scene import Camera, Sky
 from ...scene.scene import face_directions
+from ..logged_view import spread
 from . import view_kernels as kernels
 from .surfels import Surfels
 
@@ -69,8 +70,7 @@ class ProjectedView:
 
 def chosen_frames(log: DrivingLog, limit: int) -> list[int]:
     """At most ``limit`` frames with images, evenly spread, including the first and the last."""
-    seen = log.seen_frames()
-    return [seen[round(i)] for i in np.linspace(0, len(seen) - 1, min(limit, len(seen)))]
+    return spread(log.seen_frames(), limit)
 
 
 class ColourSamples:
@@ -352,7 +352,7 @@ class SkySamples:
     def finish(self, ground_colour: NDArray[np.float32]) -> Sky:
         """The cube map: medians of the observed directions, elsewhere the nearest sky colours.
 
-        Trees and walls without a Gaussian continue nowhere, unless no sky was seen at all.
+        Trees and walls without a Gaussian are not continued, unless no view shows sky.
         """
         known = self._counts > 0
         texels = np.zeros((len(self._directions), 3), dtype=np.float32)

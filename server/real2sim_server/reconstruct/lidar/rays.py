@@ -9,11 +9,10 @@ from numpy.typing import NDArray
 
 from real2sim_proto.sensors import MAX_RAYS
 
-from ...geometry import Float, apply_transform, invert_transform
+from ...geometry import Float, apply_transform, invert_transform, wrapped
 from ...logs import DrivingLog
 from ...render.cast.call import transforms_at
 from ...scene import Beams, Detection, Lidar
-from ...scene.range_sensors import wrapped
 
 # Rays of recorded sweeps: origin, direction and time.
 

@@ -28,7 +28,7 @@ from ...render.images import write_png
 from ...scene import Scene, Trajectory
 from ...scene.io import load_scene, save_scene
 from ..initialise.stage0 import initialise_scene
-from ..logged_view import objects_mask
+from ..logged_view import objects_mask, spread
 from ..options import OnProgress, ReconstructError, Stages
 from . import losses
 from .data import TrainingViews, held_out_frames, training_log
@@ -173,8 +173,8 @@ def score_held_out(
     """
     held_out = set(held_out_frames(log.frame_count, options.hold_out))
     frames = [frame for frame in log.seen_frames() if frame in held_out]
-    if limit is not None and len(frames) > limit:
-        frames = [frames[i] for i in np.linspace(0, len(frames) - 1, limit).round().astype(int)]
+    if limit is not None:
+        frames = spread(frames, limit)
     if not frames:
         return HeldOutScore(float("nan"), float("nan"), float("nan"), 0)
     views = TrainingViews(log, frames, options, device=model.device)

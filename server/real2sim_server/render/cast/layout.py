@@ -14,9 +14,8 @@ from numba import prange
 from numpy.typing import NDArray
 
 from ..._numba import PARALLEL_LOOPS
-from ...geometry import Float
+from ...geometry import Float, wrapped
 from ...scene import Beams
-from ...scene.range_sensors import wrapped
 from .._cpu.lanes import LANES, inlined, kernel, prefetch
 from ..types import weak_cache
 

@@ -159,7 +159,7 @@ def test_every_edit_of_every_chosen_vehicle_is_scored(street, scene):
         street,
         street,
         [(street.rig["front"], frame) for frame in (2, 3)],
-        on_view=lambda *progress: done.append(progress),
+        on_edit=lambda *progress: done.append(progress),
     )
     names = [(s.vehicle, s.edit) for s in scores]
     assert names == [(kind, name) for kind in ("parked", "followed") for name in edits_of("a")]

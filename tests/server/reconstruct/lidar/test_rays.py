@@ -9,6 +9,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
+from real2sim_server.geometry import wrapped
 from real2sim_server.logs import LidarSweep
 from real2sim_server.logs.driving_log import FrameSource
 from real2sim_server.reconstruct.evaluation.lidar import evaluate_sweeps, synthetic_lidar
@@ -17,7 +18,6 @@ from real2sim_server.reconstruct.lidar import RecordedRays, fit_lidar_surfaces, 
 from real2sim_server.reconstruct.lidar.rays import fit_rings
 from real2sim_server.reconstruct.options import InitialiseOptions, ReconstructError
 from real2sim_server.scene import Beams, GaussianCloud, Lidar, Scene
-from real2sim_server.scene.range_sensors import wrapped
 from real2sim_server.synthetic import SyntheticConfig, SyntheticLog, generate_log
 from real2sim_server.synthetic.street import CameraSpec
 
