@@ -73,6 +73,9 @@ def reconstruct(
     box_noise: Annotated[
         float, typer.Option(min=0, max=1, help="Noise added to boxes, as a share of their size.")
     ] = 0.0,
+    lidar_steps: Annotated[
+        int, typer.Option(min=0, help="Steps of fitting LiDAR surfaces; 0 fits none.")
+    ] = 60,
     lanes: Annotated[
         str,
         typer.Option(
@@ -121,6 +124,7 @@ def reconstruct(
                 initialise=None if iterations else _with_lanes(InitialiseOptions(), lanes),
                 training=training if iterations else None,
                 box_noise=box_noise,
+                lidar_steps=lidar_steps,
                 backend=drawn_by,
                 strict=strict,
             ),

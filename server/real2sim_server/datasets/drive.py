@@ -11,13 +11,14 @@ from typing import Protocol
 import numpy as np
 
 from ..edit import AssetLookup, ObjectState, PlacedObjects, ScenarioState, instances_at
-from ..edit.compose import NO_STRIDES, background_target, object_target, sweep_of
+from ..edit.compose import NO_STRIDES, sweep_of, targets_at
 from ..geometry import Float, matrix_to_quaternion
 from ..render.cast.call import SweepScene, incidence_of, sensor_poses, transforms_at
 from ..render.types import Instance
 from ..scene import Lidar, Scene, Stride, Trajectory
 from ..world import World
 from ..world.recording import Recording
+from ..world.sensing import ray_targets
 
 # --- Errors --------------------------------------------------------------------------------------
 
@@ -36,6 +37,7 @@ class Moment:
         placed: all present objects.
         T_world_ego: [4, 4] pose of the ego (rear axle centre on the ground).
         strides: walking states of people without a trajectory, by object id.
+        surfaces: the same world as a LiDAR sees it; empty if the scene has no LiDAR surfaces.
     """
 
     t_us: int
@@ -43,18 +45,19 @@ class Moment:
     placed: PlacedObjects[ObjectState]
     T_world_ego: Float
     strides: Mapping[str, Stride] = field(default_factory=lambda: NO_STRIDES)
+    surfaces: Sequence[Instance] = ()
 
 
 @dataclass(frozen=True, eq=False)
-class MetSweep:
+class SweepTargets:
     """Targets of a LiDAR during one sweep.
 
     Attributes:
-        things: background first, then the objects, see :class:`~..render.cast.SweepScene`.
+        scene: background first, then the objects, see :class:`~..render.cast.SweepScene`.
         T_world_lidar: [S, 4, 4] at the pose times of the sweep.
     """
 
-    things: SweepScene
+    scene: SweepScene
     T_world_lidar: Float
 
 
@@ -79,7 +82,7 @@ class Drive(Protocol):
         """Poses of the objects at a time in the span."""
         ...
 
-    def sweep_at(self, lidar: Lidar, t_us: int) -> MetSweep:
+    def sweep_at(self, lidar: Lidar, t_us: int) -> SweepTargets:
         """Targets of a LiDAR of the ego in the sweep about a time, with moving objects."""
         ...
 
@@ -106,17 +109,21 @@ class ScenarioDrive:
 
     def at(self, t_us: int) -> Moment:
         """See :class:`Drive`."""
-        instances = instances_at(self.scene, self.state, t_us)
-        return Moment(t_us, instances, self.placed_at(t_us), self.ego_at(t_us))
+        scene, state, placed = self.scene, self.state, self.placed_at(t_us)
+        surfaces: list[Instance] = []
+        if scene.lidar is not None:
+            surfaces = [instance for instance, _ in targets_at(scene, state, placed, t_us)]
+        instances = instances_at(scene, state, t_us)
+        return Moment(t_us, instances, placed, self.ego_at(t_us), surfaces=surfaces)
 
     def placed_at(self, t_us: int) -> PlacedObjects[ObjectState]:
         """See :class:`Drive`."""
         return self.state.tracks.at(t_us)
 
-    def sweep_at(self, lidar: Lidar, t_us: int) -> MetSweep:
+    def sweep_at(self, lidar: Lidar, t_us: int) -> SweepTargets:
         """See :class:`Drive`."""
         poses = sensor_poses(self.scene.ego, lidar, t_us)
-        return MetSweep(sweep_of(self.scene, self.state, lidar, t_us), poses)
+        return SweepTargets(sweep_of(self.scene, self.state, lidar, t_us), poses)
 
     def ego_at(self, t_us: int) -> Float:
         """See :class:`Drive`."""
@@ -168,7 +175,8 @@ class EpisodeDrive:
         """See :class:`Drive`."""
         world = self._world(t_us)
         ego, strides = np.array(world.T_world_body), world.strides.made
-        return Moment(t_us, world.instances(), world.agents, ego, strides)
+        surfaces = () if self.scene.lidar is None else ray_targets(world).instances
+        return Moment(t_us, world.instances(), world.agents, ego, strides, surfaces)
 
     def placed_at(self, t_us: int) -> PlacedObjects[ObjectState]:
         """See :class:`Drive`."""
@@ -190,21 +198,19 @@ class EpisodeDrive:
         times = [world.t_us for world in self.worlds]
         return max(bisect_right(times, t_us) - 1, 0)
 
-    def sweep_at(self, lidar: Lidar, t_us: int) -> MetSweep:
+    def sweep_at(self, lidar: Lidar, t_us: int) -> SweepTargets:
         """See :class:`Drive`; between steps all motion is linear."""
         place = self._place(t_us)
         near = self.worlds[max(place - 1, 0) : place + 2]
-        world, times = self.worlds[place], t_us + lidar.beams.slots[0]
-        shown_us = min(world.t_us, self.scene.end_us)
-        found, moved = [background_target(self.scene, world.state)], list[Float | None]([None])
-        for subject, transform in zip(world.agents.objects, world.agents.transforms, strict=True):
-            stride = world.strides.made.get(subject.object_id)
-            found.append(object_target(self.scene, subject, transform, shown_us, stride=stride))
-            moved.append(transforms_at(_way(near, subject.object_id), times))
-        instances, known = zip(*found, strict=True)
+        targets, times = ray_targets(self.worlds[place]), t_us + lidar.beams.slots[0]
+        # Background and fragments stay in place.
+        moved: list[Float | None] = [None] * len(targets.instances)
+        for k, object_id in enumerate(targets.object_ids, start=1):
+            moved[k] = transforms_at(_way(near, object_id), times)
         ego = _trajectory([(w.t_us, np.array(w.T_world_body)) for w in near])
         poses = transforms_at(ego, times) @ lidar.T_vehicle_lidar
-        return MetSweep(SweepScene(instances, tuple(moved), known, incidence_of(self.scene)), poses)
+        shared = targets.instances, tuple(moved), targets.attributes
+        return SweepTargets(SweepScene(*shared, incidence_of(self.scene)), poses)
 
 
 def _way(worlds: Sequence[World], object_id: str) -> Trajectory:

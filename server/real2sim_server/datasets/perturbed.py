@@ -18,7 +18,7 @@ import numpy as np
 from ..edit import ObjectState, PlacedObjects
 from ..geometry import Float, box_penetration, invert_transform
 from ..scene import Lidar, Scene
-from .drive import Drive, MetSweep, Moment
+from .drive import Drive, Moment, SweepTargets
 
 STEP_US = 50_000
 """Spacing of poses for measuring the driven distance [us]."""
@@ -114,7 +114,7 @@ class PerturbedDrive:
         """See :class:`Drive`; the oblique return path is longer."""
         return self.base.ego_speed_at(t_us) / math.cos(self.offset_at(t_us)[1])
 
-    def sweep_at(self, lidar: Lidar, t_us: int) -> MetSweep:
+    def sweep_at(self, lidar: Lidar, t_us: int) -> SweepTargets:
         """See :class:`Drive`."""
         met = self.base.sweep_at(lidar, t_us)
         times = t_us + lidar.beams.slots[0]
@@ -123,7 +123,7 @@ class PerturbedDrive:
         lateral, heading = (np.interp(times, span, pair) for pair in zip(*ends, strict=True))
         mount = lidar.T_vehicle_lidar
         ego = self._moved(met.T_world_lidar @ invert_transform(mount), lateral, heading)
-        return MetSweep(met.things, ego @ mount)
+        return SweepTargets(met.scene, ego @ mount)
 
     def offset_at(self, t_us: int) -> tuple[float, float]:
         """Lateral offset from the path, to the left [m], and heading offset [rad]."""

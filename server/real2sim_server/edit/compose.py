@@ -318,34 +318,36 @@ def sweep_of(scene: Scene, state: ScenarioState, lidar: Lidar, t_us: int) -> Swe
     """
     placed = state.tracks.at(t_us)
     times = t_us + lidar.beams.slots[0]
-    found = [background_target(scene, state)]
-    moved: list[Float | None] = [None]
-    for subject, transform in zip(placed.objects, placed.transforms, strict=True):
-        found.append(object_target(scene, subject, transform, t_us))
-        moved.append(transforms_at(subject.trajectory, times))
-    instances, known = zip(*found, strict=True)
-    return SweepScene(instances, tuple(moved), known, incidence_of(scene))
+    moved = [transforms_at(subject.trajectory, times) for subject in placed.objects]
+    instances, known = zip(*targets_at(scene, state, placed, t_us), strict=True)
+    return SweepScene(instances, (None, *moved), known, incidence_of(scene))
 
 
-def background_target(scene: Scene, state: ScenarioState) -> tuple[Instance, Attributes | None]:
-    """Geometry of the background for ray casting, without erased regions, and its attributes."""
+def targets_at(
+    scene: Scene,
+    state: ScenarioState,
+    placed: PlacedObjects[ObjectState],
+    t_us: int,
+    *,
+    strides: Mapping[str, Stride] = NO_STRIDES,
+) -> list[tuple[Instance, Attributes | None]]:
+    """Geometry for ray casting: the background without erased regions, then the objects in order;
+    each with its attributes. Fitted LiDAR surfaces replace Gaussians if the scene has them.
+
+    Args:
+        placed: objects and their poses.
+        t_us: time of the scene [us].
+        strides: gait of walking people by id; the others have that of ``t_us``.
+    """
     cloud, attributes = lidar_target(scene, None)
     if state.erased:
         cloud = kept(scene, ("lidar", state.erased), lambda: without_regions(cloud, state.erased))
-    return Instance(cloud), attributes
-
-
-def object_target(
-    scene: Scene, subject: ObjectState, transform: Float, t_us: int, *, stride: Stride | None = None
-) -> tuple[Instance, Attributes | None]:
-    """Geometry of an object at ``transform`` for ray casting, and its attributes.
-
-    A walking person has the gait phase of ``stride``, or otherwise of ``t_us``.
-    """
-    cloud, attributes = _object_cloud(scene, subject, t_us, stride)
-    semantic = semantic_class(subject.category)
-    instance = Instance(cloud, transform, subject.instance_id, subject.scale, semantic=semantic)
-    return instance, attributes
+    found = [(Instance(cloud), attributes)]
+    for subject, transform in zip(placed.objects, placed.transforms, strict=True):
+        own, known = _object_cloud(scene, subject, t_us, strides.get(subject.object_id))
+        instance = Instance(own, transform, subject.instance_id, subject.scale)
+        found.append((replace(instance, semantic=semantic_class(subject.category)), known))
+    return found
 
 
 def _object_cloud(

@@ -17,6 +17,7 @@ from .evaluation import evaluate_views, render_logged_view
 from .evaluation.uncertainty import VIEWS, fit_uncertainties
 from .initialise.stage0 import initialise_scene
 from .initialise.views import chosen_frames
+from .lidar import STEPS, fit_lidar_surfaces, has_sweeps
 from .options import InitialiseOptions, OnProgress, ReconstructError, Stages
 from .training import OnTraining, TrainOptions, held_out_frames, train, with_box_noise
 
@@ -102,6 +103,7 @@ class ReconstructOptions:
         training: None builds from LiDAR without training.
         box_noise: noise added to the boxes of the log, for measuring its correction by training;
         see ``with_box_noise``.
+        lidar_steps: steps of fitting LiDAR surfaces, see :func:`fit_lidar_surfaces`; 0 fits none.
         backend: backend of the renderer; training runs on its device.
         strict: refuse a log of which anything is left out.
     """
@@ -109,6 +111,7 @@ class ReconstructOptions:
     initialise: InitialiseOptions | None = None
     training: TrainOptions | None = None
     box_noise: float = 0.0
+    lidar_steps: int = STEPS
     backend: str = "auto"
     strict: bool = False
 
@@ -157,11 +160,11 @@ def reconstruct(
             log = with_box_noise(log, options.box_noise)
     figures = None
     if options.training is None:
-        scene = initialise_scene(
+        scene = first = initialise_scene(
             log, options=options.initialise, on_progress=on_progress, timing_s=timing_s
         )
     else:
-        scene, figures = _train(
+        scene, first, figures = _train(
             log,
             _training_options(options.training, options.initialise),
             Path(out),
@@ -174,6 +177,11 @@ def reconstruct(
             scene, _ = fit_uncertainties(
                 scene, log, views=views, backend=options.backend, on_view=report_step
             )
+    if options.lidar_steps and has_sweeps(log):
+        scene, fitted = fit_lidar_surfaces(
+            scene, log, surfaces=first, steps=options.lidar_steps, on_progress=on_progress
+        )
+        timing_s |= {f"lidar {stage}": spent for stage, spent in fitted.timing_s.items()}
     with stages("write"):
         scene = save_scene(scene, out, overwrite=overwrite)
     with stages("evaluate"):
@@ -221,7 +229,8 @@ def _train(
     resume: bool,
     stages: _Callbacks,
     backend: str,
-) -> tuple[Scene, TrainingFigures]:
+) -> tuple[Scene, Scene, TrainingFigures]:
+    """The trained scene, that of stage 0, and figures."""
     folder = out.parent / f"{out.name}.training"
     result = train(
         log,
@@ -246,7 +255,7 @@ def _train(
         stage_ms={name: 1e3 * spent / steps for name, spent in result.stage_s.items()},
         folder=str(folder),
     )
-    return result.scene, figures
+    return result.scene, result.first, figures
 
 
 def _evaluated_frames(log: DrivingLog, figures: TrainingFigures | None) -> list[int]:

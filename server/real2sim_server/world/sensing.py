@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from real2sim_proto.conventions import GROUND, STATIC
 
 from ..edit import ScenarioState
-from ..edit.compose import background_target, compose, object_target, sweep_of
+from ..edit.compose import compose, sweep_of, targets_at
 from ..geometry import Float, invert_transform, quaternion_to_matrix
 from ..render.cast.call import Attributes, SweepScene, incidence_of, sensor_poses
 from ..render.cast.sensors import Patches, Sweep, detect, radar_detections
@@ -46,13 +46,9 @@ def ray_targets(world: World) -> RayTargets:
     LiDAR surfaces replace splats if the scene has them. Objects deformed by impacts look as in
     images. Shadows are omitted.
     """
-    scene, agents = world.scene, world.agents
+    scene, agents, strides = world.scene, world.agents, world.strides.made
     shown_us = min(world.t_us, scene.end_us)
-    found = [background_target(scene, world.state)]
-    strides = world.strides.made
-    for subject, transform in zip(agents.objects, agents.transforms, strict=True):
-        stride = strides.get(subject.object_id)
-        found.append(object_target(scene, subject, transform, shown_us, stride=stride))
+    found = targets_at(scene, world.state, agents, shown_us, strides=strides)
     ids = [subject.object_id for subject in agents.objects]
     if world.deformation is not None:
         _deform(world, found, ids)

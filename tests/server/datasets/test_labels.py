@@ -6,10 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from scipy.spatial.transform import Rotation
 
-from real2sim_proto.conventions import GROUND
+from real2sim_proto.conventions import GROUND, SEMANTIC_CLASSES
 from real2sim_server.datasets.clips import flow_png, read_flow
+from real2sim_server.datasets.drive import ScenarioDrive
 from real2sim_server.datasets.labels import (
     CameraImages,
     ObjectBox,
@@ -23,9 +25,11 @@ from real2sim_server.datasets.labels import (
 )
 from real2sim_server.datasets.labels.boxes import truncation
 from real2sim_server.datasets.labels.images import body_of, on_surface
-from real2sim_server.datasets.labels.pixels import surface_mask
+from real2sim_server.datasets.labels.pixels import surface_mask, tell_apart
+from real2sim_server.edit import ScenarioState
 from real2sim_server.render.lens import back_projected
-from real2sim_server.scene import Camera, Trajectory
+from real2sim_server.scene import Camera, LidarSurfaces, Reflector, Trajectory
+from real2sim_server.scene.cloud import UNSEEN
 
 CAMERA = Camera("c", 96, 64, np.array([[60.0, 0, 48], [0, 60, 32], [0, 0, 1]]), np.eye(4))
 
@@ -212,6 +216,73 @@ def test_ground_depth_follows_the_ground_heights(tiny_scene, tiny_drive):
     shown = points[images.semantic == GROUND]
     assert len(shown) > 100
     np.testing.assert_allclose(shown[:, 2], tiny_scene.ground.height_at(shown[:, :2]), atol=5e-3)
+
+
+def drawn_with_lidar(scene, *, uncertainty: float, backend: str = "cpu") -> list[CameraImages]:
+    """The front camera of a scene without and with LiDAR surfaces: those of its blue car are 0.3 m
+    farther and half as wide.
+    """
+    parts = []
+    car = scene.object("car_blue").cloud
+    car = car.select(car.means[:, 1].abs() < 0.5)
+    for cloud in (scene.background, replace(car, means=car.means + torch.tensor([0.3, 0, 0]))):
+        known = torch.full((len(cloud),), uncertainty)
+        parts.append(Reflector(replace(cloud, uncertainties=known), torch.zeros(len(cloud), 2)))
+    surfaces = LidarSurfaces(parts[0], {"car_blue": parts[1]})
+    drawn = []
+    for each in (scene, replace(scene, lidar=surfaces)):
+        moment = ScenarioDrive(each, ScenarioState.of(each)).at(0)
+        drawn += draw_moment(each, moment, [each.rig["front"]], backend=backend)
+    return drawn
+
+
+@pytest.mark.parametrize("backend", ["cpu", "reference"])
+def test_depth_is_that_of_lidar_surfaces_where_they_show_the_same_object(tiny_scene, backend):
+    image, lidar = drawn_with_lidar(tiny_scene, uncertainty=0.0, backend=backend)
+    np.testing.assert_array_equal(image.rgb, lidar.rgb)
+    on_car = image.instance == tiny_scene.instance_id("car_blue")
+    columns = np.flatnonzero(on_car.any(axis=0))
+    middle = on_car.copy()
+    middle[:, np.abs(np.arange(on_car.shape[1]) - columns.mean()) > len(columns) / 5] = False
+    deeper = lidar.depth - image.depth
+    assert middle.sum() > 20
+    assert np.median(deeper[middle]) == pytest.approx(0.3, abs=0.02)
+    # The sides of the car, in front of which a LiDAR would see the background.
+    aside = on_car.copy()
+    aside[:, columns[2] : columns[-2]] = False
+    aside &= lidar.instance == image.instance
+    assert aside.sum() > 10
+    np.testing.assert_allclose(deeper[aside], 0, atol=1e-4)
+
+
+def test_lidar_surfaces_that_no_beam_measured_do_not_count(tiny_scene):
+    image, lidar = drawn_with_lidar(tiny_scene, uncertainty=UNSEEN)
+    np.testing.assert_array_equal(image.depth, lidar.depth)
+    np.testing.assert_array_equal(image.instance, lidar.instance)
+
+
+@pytest.mark.parametrize(
+    ("lidar", "own"),
+    [
+        (None, False),  # the body has only wheels there
+        ((1.0, 1), True),  # a side guard
+        ((1.0, 0), False),  # the road
+        ((1.3, 0), False),  # the body again, since this is neither
+    ],
+)
+def test_lidar_surfaces_tell_a_side_guard_from_a_shadow(lidar, own):
+    place, eye = np.array([0, 0.95, 9.12]), np.array([0, 9, 10.7])
+    rays = np.column_stack([np.zeros((3, 2)), place - eye, eye])
+    depth, instance = np.ones((1, 1), np.float32), np.ones((1, 1), np.uint16)
+    classes, slots = np.zeros(65_536, np.uint8), np.full(65_536, -1, np.int16)
+    slots[1], classes[1] = 0, SEMANTIC_CLASSES["car"]
+    seen = (0, 0) if lidar is None else (1, 1)
+    shown, number = lidar or (0, 0)
+    images = np.full(seen, shown, np.float32), np.full(seen, number, np.uint16)
+    ground = np.full((2, 2), 9.0), np.array([-50.0, -50.0, 100.0])
+    semantic, body = np.zeros((1, 1), np.uint8), body_of(box(0.0), pose(0, 0, 10))[None]
+    tell_apart(depth, instance, semantic, rays, slots, body, classes, 0, images, *ground)
+    assert (instance[0, 0] == 1) == own
 
 
 def test_futures_extend_to_the_end_of_the_drive(tiny_drive):

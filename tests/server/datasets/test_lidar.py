@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from real2sim_proto.conventions import GROUND, SEMANTIC_CLASSES
-from real2sim_server.datasets.drive import MetSweep
+from real2sim_server.datasets.drive import SweepTargets
 from real2sim_server.datasets.export import export_dataset
 from real2sim_server.datasets.labels import points_in_boxes
 from real2sim_server.datasets.labels.points import ROOF
 from real2sim_server.datasets.plan import ExportPlan, planned_lidar
 from real2sim_server.demo.street import SHIPPED
+from real2sim_server.render import Instance
 from real2sim_server.scene.io import read_packed
 from real2sim_server.synthetic import SyntheticConfig, generate_log
 
@@ -106,12 +108,22 @@ def test_nuscenes_has_a_class_and_a_panoptic_label_for_every_point(exported):
 def test_sweeps_follow_the_motion_in_an_episode(tiny_scene, tmp_path):
     drive = recorded_episode(tiny_scene, tmp_path)
     lidar = planned_lidar(PLAN)
-    met: MetSweep = drive.sweep_at(lidar, 200_000)
+    met: SweepTargets = drive.sweep_at(lidar, 200_000)
     recorded = drive.scene.ego.transform(200_000)
     middle = len(met.T_world_lidar) // 2
     np.testing.assert_allclose(met.T_world_lidar[middle][:3, 3] - recorded[:3, 3], ROOF, atol=0.03)
     speed = np.linalg.norm(met.T_world_lidar[-1][:3, 3] - met.T_world_lidar[0][:3, 3]) / 0.1
     assert speed == pytest.approx(5.0, rel=0.02)
+
+
+def test_sweeps_of_an_episode_contain_fragments(tiny_scene, tmp_path):
+    drive = recorded_episode(tiny_scene, tmp_path)
+    lamp = Instance(tiny_scene.object("car_blue").cloud)
+    broken = SimpleNamespace(has_impacts=False, fragments=lambda t_us: [lamp])
+    drive.worlds[-1].deformation = broken
+    targets = drive.sweep_at(planned_lidar(PLAN), drive.span[1]).scene
+    assert targets.instances[-1] is lamp
+    assert targets.poses[-1] is None
 
 
 def truth_of(columns: int):

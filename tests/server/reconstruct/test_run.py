@@ -28,10 +28,10 @@ SMALL = InitialiseOptions(
 
 def test_a_log_on_disk_becomes_a_bundle_with_a_preview(tmp_path):
     write_native_log(painted_log(frames=3), tmp_path / "log")
-    report = reconstruct(
-        tmp_path / "log", tmp_path / "out.r2s", ReconstructOptions(initialise=SMALL)
-    )
+    options = ReconstructOptions(initialise=SMALL, lidar_steps=2)
+    report = reconstruct(tmp_path / "log", tmp_path / "out.r2s", options)
     scene = load_scene(tmp_path / "out.r2s")
+    assert list(scene.lidar.objects) == ["other_1"]
     assert scene.gaussian_count == report.gaussians
     assert list(scene.objects) == ["other_1"]
     assert report.gaussians_by_object == {"other_1": len(scene.object("other_1").cloud)}
@@ -45,7 +45,7 @@ def test_training_writes_bundle_previews_metrics_and_checkpoint(tmp_path):
     training = TrainOptions(
         iterations=6, sky_resolution=16, log_every=2, checkpoint_every=3, preview_every=4
     )
-    options = ReconstructOptions(initialise=SMALL, training=training)
+    options = ReconstructOptions(initialise=SMALL, training=training, lidar_steps=2)
     report = reconstruct(tmp_path / "log", tmp_path / "out.r2s", options)
     assert report.training.steps == 6
     assert report.training.held_out_frames == report.evaluated_frames == [2]
@@ -53,6 +53,7 @@ def test_training_writes_bundle_previews_metrics_and_checkpoint(tmp_path):
     assert report.timing_s["uncertainty"] > 0
     made = load_scene(tmp_path / "out.r2s")
     assert made.has_uncertainties
+    assert made.lidar is not None
     provenance = made.provenance["reconstruction"]
     assert (provenance["iterations"], provenance["held_out_frames"]) == (6, [2])
     folder = tmp_path / "out.r2s.training"

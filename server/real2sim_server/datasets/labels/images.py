@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import cv2
@@ -15,9 +15,15 @@ from real2sim_proto.conventions import SKY, UNLABELED
 
 from ...geometry import Float, invert_transform
 from ...render import Backend, render_cameras, select_backend
-from ...render.frame import classes_of, label_cameras, labels_while_drawing
+from ...render.frame import (
+    classes_of,
+    label_cameras,
+    labels_while_drawing,
+    shown_as_colour,
+)
 from ...render.types import Window
-from ...scene import Camera, Scene
+from ...scene import Camera, Scene, Sky
+from ...scene.cloud import UNSEEN
 from ..drive import Moment
 from .boxes import Box2D, ObjectBox, boxes_at, projected_box
 from .pixels import BODY, TYRE, carry, on_bodies, tell_apart
@@ -131,6 +137,9 @@ def body_of(box: ObjectBox, T_world_object: Float) -> Float:
 
 MODALITIES = ("rgb", "median_depth", "instance")
 IDS = 1 << 16
+MEASURED = 255 * UNSEEN / 3
+"""Maximum uncertainty of LiDAR surfaces that count, out of 255: that after two recorded beams."""
+NO_LIDAR = np.zeros((0, 0), np.float32), np.zeros((0, 0), np.uint16)
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,14 +175,19 @@ def draw_moment(
     chosen = select_backend(backend) if isinstance(backend, str) else backend
     boxes = boxes_at(moment.placed)
     draw = _in_one_walk if labels_while_drawing(chosen, cameras) else _in_passes
-    found = draw(scene, moment, cameras, boxes, chosen)
-    for images in found:
-        _tell_apart(scene, moment, images, boxes)
+    found = draw(scene.sky, moment, cameras, boxes, chosen)
+    measured: Sequence[CameraImages | None] = [None] * len(found)
+    if moment.surfaces:
+        # Gaussians trained on images can be metres in front of the surface that they show.
+        surfaces = [shown_as_colour(instance) for instance in moment.surfaces]
+        measured = draw(None, replace(moment, instances=surfaces), cameras, boxes, chosen)
+    for images, lidar in zip(found, measured, strict=True):
+        _tell_apart(scene, moment, images, lidar, boxes)
     return found
 
 
 def _in_one_walk(
-    scene: Scene,
+    sky: Sky | None,
     moment: Moment,
     cameras: Sequence[Camera],
     boxes: Sequence[ObjectBox],
@@ -181,7 +195,7 @@ def _in_one_walk(
 ) -> list[CameraImages]:
     windows = [object_windows(boxes, camera, camera.pose(moment.T_world_ego)) for camera in cameras]
     frames = label_cameras(
-        moment.instances, cameras, moment.T_world_ego, windows, sky=scene.sky, backend=backend
+        moment.instances, cameras, moment.T_world_ego, windows, sky=sky, backend=backend
     )
     return [
         CameraImages(
@@ -198,7 +212,7 @@ def _in_one_walk(
 
 
 def _in_passes(
-    scene: Scene,
+    sky: Sky | None,
     moment: Moment,
     cameras: Sequence[Camera],
     boxes: Sequence[ObjectBox],
@@ -209,7 +223,7 @@ def _in_passes(
         moment.instances,
         cameras,
         moment.T_world_ego,
-        sky=scene.sky,
+        sky=sky,
         modalities=MODALITIES,
         backend=backend,
     )
@@ -227,9 +241,18 @@ def _in_passes(
 
 
 def _tell_apart(
-    scene: Scene, moment: Moment, images: CameraImages, boxes: Sequence[ObjectBox]
+    scene: Scene,
+    moment: Moment,
+    images: CameraImages,
+    lidar: CameraImages | None,
+    boxes: Sequence[ObjectBox],
 ) -> None:
-    """Write the semantic image; shadows of objects become ground."""
+    """Write the semantic image; depths become those of LiDAR surfaces, shadows become ground."""
+    if lidar is not None:
+        lidar.depth[lidar.rgb[..., 0] > MEASURED] = 0
+        for instance_id, (_, own) in images.alone.items():
+            _, measured = lidar.alone[instance_id]
+            np.copyto(own, measured, where=(own > 0) & (measured > 0))
     tell_apart(
         images.depth,
         images.instance,
@@ -239,6 +262,7 @@ def _tell_apart(
         bodies_of(boxes),
         classes_of(moment.instances),
         UNLABELED if scene.sky is None else SKY,
+        NO_LIDAR if lidar is None else (lidar.depth, lidar.instance),
         *scene.ground.grid,
     )
 

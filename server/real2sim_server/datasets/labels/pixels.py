@@ -27,6 +27,9 @@ UNDER_BODY = 0.6
 pixels of an object outside its body are background behind it.
 """
 
+AROUND = 1.0
+"""Distance from a box up to which LiDAR surfaces decide between an object and the ground [m]."""
+
 TYRE = 0.24
 """Width of the wheels, from the sides of the box inwards [m]."""
 
@@ -152,14 +155,30 @@ def shows_surface(
     return meets_wheel(body, a, b, c, fa, fb, fc)
 
 
+@func(inline="always")
+def is_under(body: Any, x: float, y: float, z: float) -> bool:
+    """Whether a point of the world is above or below a body's box or AROUND it, sideways.
+
+    Beams through windows hit the ground farther away.
+    """
+    a = body[0] * x + body[1] * y + body[2] * z + body[3]
+    b = body[4] * x + body[5] * y + body[6] * z + body[7]
+    return abs(a) < body[12] + AROUND and abs(b) < body[13] + AROUND
+
+
 @kernel(parallel=PARALLEL_LOOPS)
-def tell_apart(depth, instance, semantic, rays, slots, bodies, classes, behind, heights, frame):
+def tell_apart(
+    depth, instance, semantic, rays, slots, bodies, classes, behind, lidar, heights, frame
+):
     """Write the semantic image, and correct depth and instance image; shadows of objects become
     ground.
 
+    A pixel of an object shows its shadow where LiDAR surfaces are ground below or about the object.
+    Where they are the same object, they also give its depth. Elsewhere the object's body decides.
+
     Args:
-        depth: [H, W] float32 [m], 0 for empty pixels; changed to the depth of ``heights`` on the
-            ground.
+        depth: [H, W] float32 [m], 0 for empty pixels; changed to the depth of LiDAR surfaces of the
+            same object, and of ``heights`` on the ground.
         instance: [H, W] uint16, changed.
         semantic: [H, W] uint8, written.
         rays: [3, 4] float64: a pixel (x, y) of depth d is at d * rays[:, :3] @ (x, y, 1)
@@ -168,9 +187,11 @@ def tell_apart(depth, instance, semantic, rays, slots, bodies, classes, behind, 
         bodies: [K, BODY] see shows_surface.
         classes: [65536] uint8, by instance id.
         behind: class of empty pixels.
+        lidar: depth and instance images of LiDAR surfaces, or two images of no pixels.
         heights, frame: grid of the ground.
     """
     x0, y0, per_cell = frame[0], frame[1], 1.0 / frame[2]
+    lidar_depth, lidar_instance = lidar
     for row in prange(depth.shape[0]):
         v = row + 0.5
         for column in range(depth.shape[1]):
@@ -182,13 +203,28 @@ def tell_apart(depth, instance, semantic, rays, slots, bodies, classes, behind, 
             across = rays[0, 0] * u + rays[0, 1] * v + rays[0, 2]
             along = rays[1, 0] * u + rays[1, 1] * v + rays[1, 2]
             slope = rays[2, 0] * u + rays[2, 1] * v + rays[2, 2]
-            x, y = d * across + rays[0, 3], d * along + rays[1, 3]
-            z = d * slope + rays[2, 3]
             number = instance[row, column]
             found, slot = classes[number], slots[number]
-            shadow = slot >= 0 and not shows_surface(
-                bodies[slot], x, y, z, rays[0, 3], rays[1, 3], rays[2, 3]
-            )
+            same, shadow = False, False
+            measured = np.float64(lidar_depth[row, column]) if lidar_depth.shape[0] else 0.0
+            if measured > 0:
+                other = lidar_instance[row, column]
+                same = other == number
+                if slot >= 0 and other == 0:
+                    x, y = measured * across + rays[0, 3], measured * along + rays[1, 3]
+                    z = measured * slope + rays[2, 3]
+                    above = z - height_over(heights, x0, y0, per_cell, x, y)
+                    shadow = abs(above) < TOLERANCE and is_under(bodies[slot], x, y, z)
+                if same or shadow:
+                    d = measured
+                    depth[row, column] = d
+            x, y = d * across + rays[0, 3], d * along + rays[1, 3]
+            z = d * slope + rays[2, 3]
+            if slot >= 0 and not shadow:
+                body = bodies[slot]
+                low = body[8] * x + body[9] * y + body[10] * z + body[11] < body[16]
+                shown = shows_surface(body, x, y, z, rays[0, 3], rays[1, 3], rays[2, 3])
+                shadow = low if same else not shown
             if shadow:
                 instance[row, column], found = 0, STATIC
             if shadow or found == STATIC:

@@ -182,7 +182,7 @@ def lidar_points(
         caster: casts the rays.
     """
     met = drive.sweep_at(lidar, moment.t_us)
-    request = met.things.request(lidar, met.T_world_lidar)
+    request = met.scene.request(lidar, met.T_world_lidar)
     echo = caster.cast(request)
     sweep = detect(echo, lidar, seed=seed)
     ray, ranges, number = _returns(sweep)

@@ -33,11 +33,13 @@ HOW = {
     "truncation": "box: share of the 3D box outside of the image, by area of the faces towards the "
     "camera",
     "instance": "rendered: object of a pixel's front, the Gaussian that takes its light to a fifth "
-    "(where that is not reached, or passes draw labels, to a half); an object's shadow is ground",
+    "(where that is not reached, or passes draw labels, to a half); an object's shadow is ground, "
+    "by its box or by LiDAR surfaces",
     "semantic": "rendered: class of the object by its category; of the background the ground by "
     "geometry, within 0.15 m of the scene's height field, the sky by opacity",
-    "depth": "rendered: depth along the camera's z axis where a pixel's ray meets its front most; "
-    "of the ground that of the scene's height field [m]",
+    "depth": "rendered: depth along the camera's z axis where a pixel's ray meets its front most, "
+    "or of the LiDAR surfaces where beams measured them and they show the same object; of the "
+    "ground that of the scene's height field [m]",
     "flow": "rendered depth and poses: where the surface of a pixel is in the other image; "
     "occluded where the other image shows something else there",
     "points": "rendered: points of the cameras' depth images along the beams of a spinning "

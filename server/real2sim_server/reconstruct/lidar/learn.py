@@ -17,6 +17,7 @@ from ...render.cast.call import recorded_scene, sensor_poses
 from ...render.cast.cpu import CpuCaster
 from ...render.cast.types import CastRequest, RayHits
 from ...scene import Beams, GaussianCloud, Lidar, LidarSurfaces, Reflector, Scene
+from ...scene.cloud import UNSEEN
 from .rays import RecordedRays
 
 # --- Loss of rays ---------------------------------------------------------------------------------
@@ -101,6 +102,7 @@ class SurfaceTable:
         logit, size, shift: [N] float32, learnt: logit of the opacity, logarithm of the factor of
             the scales along the surface, shift along the normal [m].
         attributes: [N, 2] float32, see ``Reflector``.
+        uncertainties: [N] float32, see ``Reflector``.
     """
 
     object_ids: tuple[str, ...]
@@ -113,11 +115,13 @@ class SurfaceTable:
     size: Array = field(init=False)
     shift: Array = field(init=False)
     attributes: Array = field(init=False)
+    uncertainties: Array = field(init=False)
 
     def __post_init__(self) -> None:
         count = len(self.means)
         self.size, self.shift = np.zeros((2, count), np.float32)
         self.attributes = np.zeros((count, 2), np.float32)
+        self.uncertainties = np.full(count, UNSEEN, np.float32)
 
     @classmethod
     def of(cls, clouds: list[GaussianCloud], object_ids: tuple[str, ...]) -> SurfaceTable:
@@ -152,15 +156,14 @@ class SurfaceTable:
         wide = np.exp(self.size)[:, None]
         scales = np.concatenate([self.scales[:, :2] * wide, self.scales[:, 2:]], axis=1)
         means = self.means + self.axes[:, :, 2] * self.shift[:, None]
-        columns = (means, self.quats, scales, self.opacities)
+        columns = (means, self.quats, scales, self.opacities, self.uncertainties)
         parts = []
         for body in range(len(self.firsts) - 1):
             part = slice(self.firsts[body], self.firsts[body + 1])
             own = (torch.from_numpy(np.ascontiguousarray(column[part])) for column in columns)
-            means_of, quats, scales_of, opacities = own
-            cloud = GaussianCloud(
-                means_of, quats, scales_of, opacities, sh=torch.zeros(len(means_of), 1, 3)
-            )
+            means_of, quats, scales_of, opacities, uncertainties = own
+            sh = torch.zeros(len(means_of), 1, 3)
+            cloud = GaussianCloud(means_of, quats, scales_of, opacities, sh, uncertainties)
             attributes = torch.from_numpy(self.attributes[part].copy())
             parts.append(Reflector(cloud, attributes))
         objects = dict(zip(self.object_ids, parts[1:], strict=True))
@@ -173,7 +176,7 @@ class SurfaceTable:
             getattr(self, name)[kept] for name in ("means", "quats", "axes", "scales", "logit")
         )
         made = SurfaceTable(self.object_ids, np.cumsum([0, *counts]).astype(np.int64), *laid_out)
-        for name in ("size", "shift", "attributes"):
+        for name in ("size", "shift", "attributes", "uncertainties"):
             setattr(made, name, getattr(self, name)[kept])
         return made
 

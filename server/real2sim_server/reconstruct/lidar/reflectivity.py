@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ...logs import DrivingLog
 from ...render.cast.call import facing_of_request
 from ...scene import Scene
+from ...scene.cloud import UNSEEN
 from ...scene.lidar_surfaces import MAX_REFLECTIVITY, RANGE_STEPS, RingResponse
 from .learn import SeenSweep, SurfaceTable, part_of, trace
 
@@ -133,7 +134,9 @@ def light_of(
 
 
 def fit_reflectivity(table: SurfaceTable, lit: LitRays) -> FittedReflectivity:
-    """Fit the reflectivity of each Gaussian, in place, and the common parameters."""
+    """Fit the reflectivity of each Gaussian, in place, and the common parameters; also writes the
+    uncertainties.
+    """
     cells = max(len(lit.rings), 1) * (len(RANGE_STEPS) - 1)
     gain, offset = np.ones(cells), np.zeros(cells)
     incidence = min(INCIDENCES, key=lambda given: _misfit(lit, given, len(table)))
@@ -145,7 +148,9 @@ def fit_reflectivity(table: SurfaceTable, lit: LitRays) -> FittedReflectivity:
         explained = np.bincount(lit.ray, light, len(lit.intensity)).astype(np.float64)
         if len(lit.rings):
             gain, offset = _responses(lit, explained, cells)
-    met = np.bincount(lit.member, lit.share, len(table)) > 0
+    stopped = np.bincount(lit.member, lit.share, len(table))
+    table.uncertainties[:] = UNSEEN / (1 + stopped)
+    met = stopped > 0
     off = lit.intensity - explained * gain[lit.cell] - offset[lit.cell]
     table.attributes[:, 0] = np.clip(values, DARKEST, MAX_REFLECTIVITY)
     if met.any():
@@ -199,12 +204,21 @@ def _reflectivities(
     # Each hit is weighted by its share, the light on the Gaussian.
     light = np.bincount(lit.member, factor * factor / np.maximum(lit.share, 1e-6), len(values))
     mean = float(np.average(values, weights=light)) if light.sum() > 0 else UNKNOWN
+    rays = _matrix(lit.ray, lit.member, factor, (len(wanted), len(values)))
     for _ in range(INNER):
-        off = wanted - np.bincount(lit.ray, factor * values[lit.member], len(wanted))
-        pull = np.bincount(lit.member, factor * off[lit.ray], len(values))
-        lean = PRIOR * (mean - values)
-        values = values + (pull + lean) / (light + PRIOR)
+        pull = rays.T @ (wanted - rays @ values)
+        values = values + (pull + PRIOR * (mean - values)) / (light + PRIOR)
     return values
+
+
+def _matrix(
+    ray: NDArray[Any], member: NDArray[np.int32], weight: NDArray[Any], shape: tuple[int, int]
+) -> Any:
+    """Sparse matrix of hits [R, N], from hits [M] by increasing ray."""
+    from scipy.sparse import csr_array
+
+    begins = np.concatenate([[0], np.cumsum(np.bincount(ray, minlength=shape[0]))])
+    return csr_array((weight.astype(np.float64), member, begins), shape=shape)
 
 
 def _responses(
@@ -311,9 +325,9 @@ def _solved(
     light = np.bincount(member, share, count)
     mean = float(lost.mean())
     values = np.full(count, mean)
+    rays = _matrix(ray, member, share, (len(lost), count))
     for _ in range(LOSS_ROUNDS):
-        off = lost - np.bincount(ray, share * values[member], len(lost))
-        pull = np.bincount(member, share * off[ray], count)
+        pull = rays.T @ (lost - rays @ values)
         values = np.clip(
             values + (pull + LOSS_PRIOR * (mean - values)) / (light + LOSS_PRIOR), 0, 1
         )

@@ -304,6 +304,12 @@ def fit_lidar_surfaces(
     return replace(made, lidar=replace(made.lidar, response=fitted.response)), report
 
 
+def has_sweeps(log: DrivingLog) -> bool:
+    """Whether any sweep of the log has points. Raises LogError if one cannot be read."""
+    frames = (frame for frame in range(log.frame_count) if frame not in log.absent_sweeps)
+    return any(len(log.lidar(frame).points) for frame in frames)
+
+
 def held_out_of(scene: Scene) -> set[int]:
     """Frames of the log that the scene was made without."""
     made = scene.provenance.get("reconstruction")

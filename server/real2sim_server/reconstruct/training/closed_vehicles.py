@@ -23,6 +23,7 @@ from ...scene import GaussianCloud, SceneObject
 from ...scene.cloud import SH_C0
 from ..initialise.vehicle_body import SPACING, VehicleBody, body_colours
 from ..initialise.vehicle_parts import light_on, palette_of
+from . import kernels
 from .densify import SelectiveAdam, rotation_matrices
 from .gaussians import FIELDS, OBJECT_FIELDS
 from .model import SceneModel
@@ -38,14 +39,6 @@ ONE_DIRECTION = float(np.radians(5))
 """Root mean square angle up to which viewing directions count as one direction."""
 KEPT_DEPTH = 0.05
 """Remaining fraction of the depth about a surface, so that the order in depth is preserved."""
-HIT = 0.07
-"""Maximum distance of a ray from a surface point that it hits [m]."""
-LAYER = 0.15
-"""Maximum depth behind the first hit point of points on the same surface [m]."""
-EDGE_ON = 0.2
-"""Gaussians follow the surface up to this cosine between normal and ray; beyond it they face the
-ray.
-"""
 MIN_SPREAD = 2e-3
 """Minimum standard deviation of projected Gaussians [m]."""
 SHADOW = 0.3
@@ -55,7 +48,6 @@ INSETS = (1.0, 0.96, 0.92, 0.87, 0.82)
 outline."""
 DISC = (0.7, 0.7, 0.15)
 """Standard deviation of a body's Gaussians, relative to their spacing."""
-ROWS = 2000
 
 
 @torch.no_grad()
@@ -225,32 +217,7 @@ def _hits(origins: Tensor, rays: Tensor, points: Tensor, normals: Tensor) -> tup
         Distances [M] along the rays [m] and normals [M, 3] there, against the rays. Lines that miss
         get the distance of closest approach, and the ray itself as normal.
     """
-    parts = [
-        _hits_of(o, r, points, normals)
-        for o, r in zip(origins.split(ROWS), rays.split(ROWS), strict=True)
-    ]
-    distances, at = zip(*parts, strict=True)
-    return torch.cat(distances), torch.cat(at)
-
-
-def _hits_of(
-    origins: Tensor, rays: Tensor, points: Tensor, normals: Tensor
-) -> tuple[Tensor, Tensor]:
-    along = rays @ points.T - (rays * origins).sum(-1, keepdim=True)
-    squares = origins.square().sum(-1, keepdim=True) - 2 * origins @ points.T
-    aside = (squares + points.square().sum(-1) - along.square()).clamp(min=0).sqrt()
-    cosines = -rays @ normals.T
-    hit = (aside < HIT) & (cosines > EDGE_ON / 4)
-    first = torch.where(hit, along, torch.inf).amin(1)
-    weight = (hit & (along < first[:, None] + LAYER)) / (aside + 0.01)
-    weight /= weight.sum(1, keepdim=True).clamp(min=1e-9)
-    normal, place = normalize(weight @ normals, dim=-1), weight @ points
-    cosine = (normal * rays).sum(-1)
-    on_plane = ((place - origins) * normal).sum(-1) / cosine.clamp(max=-EDGE_ON / 2)
-    # At a bend, the plane through the points can be far from them along a grazing ray.
-    on_plane = torch.minimum(torch.maximum(on_plane, first - 2 * LAYER), first + 2 * LAYER)
-    closest = torch.where(cosines > -EDGE_ON, aside, torch.inf).argmin(1, keepdim=True)
-    meets = torch.isfinite(first)
-    distance = torch.where(meets, on_plane, along.gather(1, closest)[:, 0])
-    upright = ~meets | (cosine > -EDGE_ON)
-    return distance, torch.where(upright[:, None], -rays, normal)
+    distances, at = np.empty(len(origins), np.float32), np.empty((len(origins), 3), np.float32)
+    surface = (np.ascontiguousarray(part.T.numpy()) for part in (points, normals))
+    kernels.first_hits(origins.numpy(), rays.numpy(), *surface, distances, at)
+    return torch.from_numpy(distances), torch.from_numpy(at)

@@ -1,11 +1,13 @@
-"""Compiled loops of training: activations, Adam, structural similarity."""
+"""Compiled loops of training: activations, Adam, structural similarity, lines."""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 from numba import prange
 
-from ..._numba import kernel
+from ..._numba import PARALLEL_LOOPS, func, kernel
 
 # Activations and their gradients. Rows are independent, so results do not depend on the number of
 # threads.
@@ -263,3 +265,83 @@ def gather_slopes(image, truth, slopes, window, factor, gradient):
             gradient[row, i] = factor * (
                 blurred[0, i] + 2 * image[row, i] * blurred[1, i] + truth[row, i] * blurred[2, i]
             )
+
+
+# Lines through followed vehicles, and the surfaces of their bodies.
+
+HIT = 0.07
+"""Maximum distance of a ray from a surface point that it hits [m]."""
+LAYER = 0.15
+"""Maximum depth behind the first hit point of points on the same surface [m]."""
+EDGE_ON = 0.2
+"""Gaussians follow the surface up to this cosine between normal and ray; beyond it they face the
+ray.
+"""
+F32 = np.float32
+ZERO = F32(0)
+MISSED = F32(1e9)
+"""Distance of lines that hit nothing [m]."""
+NEAR_LINE, FACING = F32(HIT**2), F32(EDGE_ON / 4)
+"""Maximum squared distance of a hit point [m2], and minimum cosine of its normal to the ray."""
+SOFT = F32(0.01)
+"""Distance from a ray at which points have half of the greatest weight [m]."""
+
+
+@kernel(nogil=True, fastmath=True, parallel=PARALLEL_LOOPS)
+def first_hits(origins, rays, points, normals, distances, at):
+    """Intersect lines with a point surface, see ``closed_vehicles``.
+
+    Args:
+        origins, rays: [M, 3] float32, points on the lines and their unit directions.
+        points, normals: [3, P] float32, of the surface.
+        distances, at: [M] and [M, 3] float32, written: distance along the ray [m], and normal.
+    """
+    for k in prange(len(origins)):
+        o, r = origins[k], rays[k]
+        first = MISSED
+        for p in range(points.shape[1]):
+            along, aside, facing = _about_line(points, normals, p, o, r)
+            hit = aside < NEAR_LINE and facing > FACING
+            first = min(first, along if hit else MISSED)
+        if first < MISSED:
+            nx = ny = nz = px = py = pz = ZERO
+            total, last = F32(1e-9), first + F32(LAYER)
+            for p in range(points.shape[1]):
+                along, aside, facing = _about_line(points, normals, p, o, r)
+                hit = aside < NEAR_LINE and facing > FACING and along < last
+                weight = ONE / (math.sqrt(max(aside, ZERO)) + SOFT) if hit else ZERO
+                total += weight
+                nx += weight * normals[0, p]
+                ny += weight * normals[1, p]
+                nz += weight * normals[2, p]
+                px += weight * points[0, p]
+                py += weight * points[1, p]
+                pz += weight * points[2, p]
+            length = max(math.sqrt(nx * nx + ny * ny + nz * nz), 1e-9)
+            at[k, 0], at[k, 1], at[k, 2] = nx / length, ny / length, nz / length
+            cosine, on_plane = 0.0, 0.0
+            for axis, place in enumerate((px, py, pz)):
+                cosine += at[k, axis] * r[axis]
+                on_plane += (place / total - o[axis]) * at[k, axis]
+            on_plane /= min(cosine, -EDGE_ON / 2)
+            # At a bend, the plane through the points can be far from them along a grazing ray.
+            distances[k] = min(max(on_plane, first - 2 * LAYER), first + 2 * LAYER)
+        else:
+            cosine, nearest = 0.0, MISSED
+            for p in range(points.shape[1]):
+                along, aside, facing = _about_line(points, normals, p, o, r)
+                if facing > -EDGE_ON and aside < nearest:
+                    nearest, distances[k] = aside, along
+        if cosine > -EDGE_ON:
+            at[k, 0], at[k, 1], at[k, 2] = -r[0], -r[1], -r[2]
+
+
+@func(inline="always")
+def _about_line(points, normals, p, o, r):
+    """Distance of a point along a line, its squared distance from it, and the cosine of its normal
+    against the line.
+    """
+    x, y, z = points[0, p] - o[0], points[1, p] - o[1], points[2, p] - o[2]
+    along = x * r[0] + y * r[1] + z * r[2]
+    facing = -(normals[0, p] * r[0] + normals[1, p] * r[1] + normals[2, p] * r[2])
+    return along, x * x + y * y + z * z - along * along, facing

@@ -217,6 +217,7 @@ class TrainResult:
 
     Attributes:
         scene: trained, not yet saved.
+        first: scene of stage 0, with which training began.
         score: over the held-out frames.
         seconds: duration of the steps in this run.
         steps: number of steps in this run; fewer than in total if it was resumed.
@@ -224,6 +225,7 @@ class TrainResult:
     """
 
     scene: Scene
+    first: Scene
     score: HeldOutScore
     seconds: float
     steps: int
@@ -286,7 +288,7 @@ def train(
         held_out_frames=held_out_frames(log.frame_count, options.hold_out),
     )
     steps = options.iterations - first
-    return TrainResult(trained, score, seconds, steps, trainer.running.stages)
+    return TrainResult(trained, scene, score, seconds, steps, trainer.running.stages)
 
 
 def _first_scene(

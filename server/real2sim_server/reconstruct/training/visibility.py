@@ -83,7 +83,7 @@ def visibility(model: SceneModel, viewpoints: Sequence[Viewpoint]) -> GaussianVi
     """Visibility of each Gaussian of ``model`` in ``viewpoints``.
 
     Where training mirrors vehicles, both sides count: the part hidden on one side is learnt on the
-    other.
+    other. Every second view also shows them mirrored.
     """
     gaussians = model.gaussians
     starts = gaussians.starts
@@ -92,7 +92,8 @@ def visibility(model: SceneModel, viewpoints: Sequence[Viewpoint]) -> GaussianVi
     )
     flips = [(), model.mirrored] if any(model.mirrored) else [()]
     sides = [gaussians.clouds(degree=0, mirrored=mirrored) for mirrored in flips]
-    for (camera, t_us), clouds in itertools.product(viewpoints, sides):
+    shown = [(view, side) for k, view in enumerate(viewpoints) for side in sides[: 2 - k % 2]]
+    for (camera, t_us), clouds in shown:
         viewmat = model.viewmat(camera, t_us).detach()
         instances, drawn = model.instances(clouds, t_us)
         weights = blending_weights(instances, viewmat, camera, model)

@@ -519,7 +519,8 @@ def _response(part: ResponsePart | None) -> RingResponse | None:
 
 
 def _reflector(file: TensorFile, prefix: str, part: ReflectorPart, what: str) -> Reflector:
-    taken = file.take(prefix, shapes=reflector_shapes(part.gaussians), hashes=part.tensors)
+    shapes = reflector_shapes(part.gaussians, part.tensors)
+    taken = file.take(prefix, shapes=shapes, hashes=part.tensors)
     attributes = taken.pop("attributes")
     reflector = Reflector(GaussianCloud(**taken, sh=torch.zeros(part.gaussians, 1, 3)), attributes)
     if file.verify:

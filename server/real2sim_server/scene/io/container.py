@@ -58,17 +58,15 @@ def figure_shapes(gaussians: int) -> dict[str, tuple[int, ...]]:
 
 
 def reflector_tensors(reflector: Reflector) -> dict[str, Tensor]:
-    """Tensors of a reflector by name, on the CPU and contiguous, without colours and
-    uncertainties."""
+    """Tensors of a reflector by name, on the CPU and contiguous, without colours."""
     tensors = cloud_tensors(reflector.cloud)
-    for name in ("sh", UNCERTAINTIES):
-        tensors.pop(name, None)
+    del tensors["sh"]
     return tensors | {"attributes": reflector.attributes.detach().cpu().contiguous()}
 
 
-def reflector_shapes(gaussians: int) -> dict[str, tuple[int, ...]]:
-    """Shapes of :func:`reflector_tensors`."""
-    shapes = cloud_shapes(gaussians, 0)
+def reflector_shapes(gaussians: int, known: Container[str]) -> dict[str, tuple[int, ...]]:
+    """Shapes of :func:`reflector_tensors` with the names ``known``."""
+    shapes = cloud_shapes(gaussians, 0, known=known)
     del shapes["sh"]
     return shapes | {"attributes": (gaussians, 2)}
 

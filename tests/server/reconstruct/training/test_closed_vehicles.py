@@ -8,7 +8,7 @@ import torch
 
 from real2sim_server.geometry import invert_transform
 from real2sim_server.reconstruct.initialise.vehicle_body import VehicleBody, fitted_body
-from real2sim_server.reconstruct.training import SceneModel
+from real2sim_server.reconstruct.training import SceneModel, closed_vehicles
 from real2sim_server.reconstruct.training.closed_vehicles import (
     INSETS,
     close_followed,
@@ -20,6 +20,7 @@ from real2sim_server.scene.cloud import SH_C0
 
 from .conftest import TINY
 
+FORWARD = torch.nn.functional.normalize(torch.tensor([[1.0, 0.1, 0.0]]), dim=1)
 SALOON = (4.7, 1.82, 1.46)
 GREEN = torch.tensor([0.1, 0.4, 0.2])
 
@@ -37,6 +38,28 @@ def ahead(tiny_scene):
     pose = tiny_scene.ego.transform(tiny_scene.start_us)
     pose = pose @ np.array([[1, 0, 0, 12.0], [0, 1, 0, 0], [0, 0, 1, 0.75], [0, 0, 0, 1]])
     return tiny_scene.rig.cameras[0], tiny_scene.start_us, pose
+
+
+@pytest.mark.parametrize(
+    ("origin", "distance", "normal"),
+    [
+        ((-2.0, 0.0, 0.0), 2.0, (-1, 0, 0)),  # the nearer wall, not the one behind it
+        ((0.5, 0.0, 0.0), -0.5, (-1, 0, 0)),  # lines also hit what is behind their origin
+        ((-2.0, 9.0, 0.0), None, None),  # a miss
+    ],
+)
+def test_lines_hit_the_first_wall_that_faces_them(origin, distance, normal):
+    y, z = np.meshgrid(*[np.arange(-1, 1, 0.03)] * 2)
+    wall = np.stack([np.zeros(y.size), y.ravel(), z.ravel()], axis=1)
+    places = [np.add(wall, (x, 0, 0)) for x in (0, 1, -1)]
+    points = torch.from_numpy(np.concatenate(places)).float()
+    normals = torch.tensor([[-1.0, 0, 0], [-1, 0, 0], [1, 0, 0]]).repeat_interleave(len(wall), 0)
+    found, at = closed_vehicles._hits(torch.tensor([origin]), FORWARD, points, normals)
+    if normal is None:
+        torch.testing.assert_close(at, -FORWARD)
+        return
+    torch.testing.assert_close(found, distance / FORWARD[:, 0], atol=1e-4, rtol=0)
+    torch.testing.assert_close(at, torch.tensor([normal], dtype=torch.float32))
 
 
 def model_of(scene, pose, means: torch.Tensor) -> SceneModel:

@@ -24,6 +24,7 @@ from real2sim_server.scene.lidar_surfaces import RANGE_STEPS
 def surfaces(make_cloud):
     def reflector(count: int) -> Reflector:
         cloud = make_cloud(count, degree=0)
+        cloud = replace(cloud, uncertainties=torch.linspace(0, 0.25, count))
         return Reflector(cloud, torch.linspace(0, 1, 2 * count).reshape(count, 2))
 
     return LidarSurfaces(reflector(7), {"car_3": reflector(3)})
@@ -39,8 +40,17 @@ def test_surfaces_round_trip(scene, surfaces, tmp_path):
     ]
     for written, back in pairs:
         assert torch.equal(written.attributes, back.attributes)
-        for name in ("means", "quats", "scales", "opacities"):
+        for name in ("means", "quats", "scales", "opacities", "uncertainties"):
             assert torch.equal(getattr(written.cloud, name), getattr(back.cloud, name))
+
+
+def test_surfaces_without_uncertainties_round_trip(scene, surfaces, tmp_path):
+    cloud = replace(surfaces.background.cloud, uncertainties=None)
+    older = LidarSurfaces(Reflector(cloud, surfaces.background.attributes))
+    save_scene(replace(scene, lidar=older), tmp_path / "a.r2s")
+    read = load_scene(tmp_path / "a.r2s").lidar
+    assert read is not None
+    assert read.background.cloud.uncertainties is None
 
 
 def test_incidence_and_ring_response_round_trip(scene, surfaces, tmp_path):
