@@ -13,7 +13,13 @@ import numpy as np
 from ..edit import AssetLookup, ObjectState, PlacedObjects, ScenarioState, instances_at
 from ..edit.compose import NO_STRIDES, sweep_of, targets_at
 from ..geometry import Float, matrix_to_quaternion
-from ..render.cast.call import SweepScene, incidence_of, sensor_poses, transforms_at
+from ..render.cast.call import (
+    Attributes,
+    SweepScene,
+    incidence_of,
+    sensor_poses,
+    transforms_at,
+)
 from ..render.types import Instance
 from ..scene import Lidar, Scene, Stride, Trajectory
 from ..world import World
@@ -37,7 +43,8 @@ class Moment:
         placed: all present objects.
         T_world_ego: [4, 4] pose of the ego (rear axle centre on the ground).
         strides: walking states of people without a trajectory, by object id.
-        surfaces: the same world as a LiDAR sees it; empty if the scene has no LiDAR surfaces.
+        surfaces: the same world as LiDARs see it, with attributes of fitted surfaces, see
+            ``targets_at``; empty if the scene has no LiDAR surfaces.
     """
 
     t_us: int
@@ -45,7 +52,7 @@ class Moment:
     placed: PlacedObjects[ObjectState]
     T_world_ego: Float
     strides: Mapping[str, Stride] = field(default_factory=lambda: NO_STRIDES)
-    surfaces: Sequence[Instance] = ()
+    surfaces: Sequence[tuple[Instance, Attributes | None]] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,9 +117,7 @@ class ScenarioDrive:
     def at(self, t_us: int) -> Moment:
         """See :class:`Drive`."""
         scene, state, placed = self.scene, self.state, self.placed_at(t_us)
-        surfaces: list[Instance] = []
-        if scene.lidar is not None:
-            surfaces = [instance for instance, _ in targets_at(scene, state, placed, t_us)]
+        surfaces = () if scene.lidar is None else targets_at(scene, state, placed, t_us)
         instances = instances_at(scene, state, t_us)
         return Moment(t_us, instances, placed, self.ego_at(t_us), surfaces=surfaces)
 
@@ -175,7 +180,10 @@ class EpisodeDrive:
         """See :class:`Drive`."""
         world = self._world(t_us)
         ego, strides = np.array(world.T_world_body), world.strides.made
-        surfaces = () if self.scene.lidar is None else ray_targets(world).instances
+        surfaces: Sequence[tuple[Instance, Attributes | None]] = ()
+        if self.scene.lidar is not None:
+            targets = ray_targets(world)
+            surfaces = list(zip(targets.instances, targets.attributes, strict=True))
         return Moment(t_us, world.instances(), world.agents, ego, strides, surfaces)
 
     def placed_at(self, t_us: int) -> PlacedObjects[ObjectState]:

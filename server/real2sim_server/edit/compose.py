@@ -332,7 +332,8 @@ def targets_at(
     strides: Mapping[str, Stride] = NO_STRIDES,
 ) -> list[tuple[Instance, Attributes | None]]:
     """Geometry for ray casting: the background without erased regions, then the objects in order;
-    each with its attributes. Fitted LiDAR surfaces replace Gaussians if the scene has them.
+    each with its attributes. Fitted LiDAR surfaces replace Gaussians where the scene has them; the
+    rest has no attributes.
 
     Args:
         placed: objects and their poses.
@@ -345,8 +346,9 @@ def targets_at(
     found = [(Instance(cloud), attributes)]
     for subject, transform in zip(placed.objects, placed.transforms, strict=True):
         own, known = _object_cloud(scene, subject, t_us, strides.get(subject.object_id))
-        instance = Instance(own, transform, subject.instance_id, subject.scale)
-        found.append((replace(instance, semantic=semantic_class(subject.category)), known))
+        semantic = semantic_class(subject.category)
+        drawn = Instance(own, transform, subject.instance_id, subject.scale, semantic=semantic)
+        found.append((drawn, known))
     return found
 
 

@@ -177,7 +177,7 @@ def reconstruct(
             scene, _ = fit_uncertainties(
                 scene, log, views=views, backend=options.backend, on_view=report_step
             )
-    if options.lidar_steps and has_sweeps(log):
+    if options.lidar_steps and has_sweeps(log, scene):
         scene, fitted = fit_lidar_surfaces(
             scene, log, surfaces=first, steps=options.lidar_steps, on_progress=on_progress
         )

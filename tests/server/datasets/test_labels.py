@@ -261,6 +261,20 @@ def test_lidar_surfaces_that_no_beam_measured_do_not_count(tiny_scene):
     np.testing.assert_array_equal(image.instance, lidar.instance)
 
 
+def test_objects_without_lidar_surfaces_keep_their_labels(tiny_scene):
+    car = tiny_scene.object("car_blue")
+    known = replace(car.cloud, uncertainties=torch.zeros(len(car.cloud)))
+    objects = {**tiny_scene.objects, "car_blue": replace(car, cloud=known)}
+    background = Reflector(tiny_scene.background, torch.zeros(len(tiny_scene.background), 2))
+    drawn = []
+    for lidar in (None, LidarSurfaces(background)):
+        scene = replace(tiny_scene, objects=objects, lidar=lidar)
+        moment = ScenarioDrive(scene, ScenarioState.of(scene)).at(0)
+        drawn += draw_moment(scene, moment, [scene.rig["front"]])
+    image, lidar = drawn
+    np.testing.assert_array_equal(image.instance, lidar.instance)
+
+
 @pytest.mark.parametrize(
     ("lidar", "own"),
     [

@@ -176,11 +176,15 @@ def draw_moment(
     boxes = boxes_at(moment.placed)
     draw = _in_one_walk if labels_while_drawing(chosen, cameras) else _in_passes
     found = draw(scene.sky, moment, cameras, boxes, chosen)
-    measured: Sequence[CameraImages | None] = [None] * len(found)
+    measured: list[Any] = [None] * len(found)
     if moment.surfaces:
         # Gaussians trained on images can be metres in front of the surface that they show.
-        surfaces = [shown_as_colour(instance) for instance in moment.surfaces]
+        surfaces = [shown_as_colour(instance) for instance, _ in moment.surfaces]
         measured = draw(None, replace(moment, instances=surfaces), cameras, boxes, chosen)
+        is_fitted = np.zeros(IDS, np.bool_)
+        is_fitted[[i.instance_id for i, known in moment.surfaces if known is not None]] = True
+        for lidar in measured:
+            lidar.depth[~is_fitted[lidar.instance] | (lidar.rgb[..., 0] > MEASURED)] = 0
     for images, lidar in zip(found, measured, strict=True):
         _tell_apart(scene, moment, images, lidar, boxes)
     return found
@@ -249,7 +253,6 @@ def _tell_apart(
 ) -> None:
     """Write the semantic image; depths become those of LiDAR surfaces, shadows become ground."""
     if lidar is not None:
-        lidar.depth[lidar.rgb[..., 0] > MEASURED] = 0
         for instance_id, (_, own) in images.alone.items():
             _, measured = lidar.alone[instance_id]
             np.copyto(own, measured, where=(own > 0) & (measured > 0))

@@ -304,10 +304,12 @@ def fit_lidar_surfaces(
     return replace(made, lidar=replace(made.lidar, response=fitted.response)), report
 
 
-def has_sweeps(log: DrivingLog) -> bool:
-    """Whether any sweep of the log has points. Raises LogError if one cannot be read."""
-    frames = (frame for frame in range(log.frame_count) if frame not in log.absent_sweeps)
-    return any(len(log.lidar(frame).points) for frame in frames)
+def has_sweeps(log: DrivingLog, scene: Scene) -> bool:
+    """Whether the log has sweeps that ``scene`` does not hold out. Raises LogError if one cannot be
+    read.
+    """
+    frames = set(range(log.frame_count)) - held_out_of(scene) - log.absent_sweeps
+    return any(recorded_rays(log, frame) is not None for frame in sorted(frames))
 
 
 def held_out_of(scene: Scene) -> set[int]:
