@@ -32,8 +32,8 @@ class Reflector:
     """Gaussians as a LiDAR sees them.
 
     Attributes:
-        cloud: cloud in the frame of the background or of the object. Its uncertainties fall from
-            UNSEEN, where no recorded beam was stopped, to half of it after one beam, and on.
+        cloud: cloud in the frame of the background or of the object. Its uncertainties are
+            UNSEEN / (1 + number of recorded beams that a Gaussian stops).
         attributes: [N, 2] float32: reflectivity at normal incidence, 0 to MAX_REFLECTIVITY, and
             share of lost rays, 0 to 1.
 

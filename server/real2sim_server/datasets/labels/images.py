@@ -137,7 +137,7 @@ def body_of(box: ObjectBox, T_world_object: Float) -> Float:
 
 MODALITIES = ("rgb", "median_depth", "instance")
 IDS = 1 << 16
-MEASURED = 255 * UNSEEN / 3
+MAX_UNCERTAINTY = 255 * UNSEEN / 3
 """Maximum uncertainty of LiDAR surfaces that count, out of 255: that after two recorded beams."""
 NO_LIDAR = np.zeros((0, 0), np.float32), np.zeros((0, 0), np.uint16)
 
@@ -176,18 +176,27 @@ def draw_moment(
     boxes = boxes_at(moment.placed)
     draw = _in_one_walk if labels_while_drawing(chosen, cameras) else _in_passes
     found = draw(scene.sky, moment, cameras, boxes, chosen)
-    measured: list[Any] = [None] * len(found)
+    lidar = [NO_LIDAR] * len(found)
     if moment.surfaces:
         # Gaussians trained on images can be metres in front of the surface that they show.
         surfaces = [shown_as_colour(instance) for instance, _ in moment.surfaces]
-        measured = draw(None, replace(moment, instances=surfaces), cameras, boxes, chosen)
-        is_fitted = np.zeros(IDS, np.bool_)
-        is_fitted[[i.instance_id for i, known in moment.surfaces if known is not None]] = True
-        for lidar in measured:
-            lidar.depth[~is_fitted[lidar.instance] | (lidar.rgb[..., 0] > MEASURED)] = 0
-    for images, lidar in zip(found, measured, strict=True):
-        _tell_apart(scene, moment, images, lidar, boxes)
+        drawn = draw(None, replace(moment, instances=surfaces), cameras, (), chosen)
+        lidar = [_measured(images, moment) for images in drawn]
+    for images, measured in zip(found, lidar, strict=True):
+        _tell_apart(scene, moment, images, measured, boxes)
     return found
+
+
+def _measured(
+    drawn: CameraImages, moment: Moment
+) -> tuple[NDArray[np.float32], NDArray[np.uint16]]:
+    """Depth and instance images of LiDAR surfaces, whose colours are their uncertainties; depth 0
+    where no surface was fitted or no beam measured it.
+    """
+    is_fitted = np.zeros(IDS, np.bool_)
+    is_fitted[[i.instance_id for i, known in moment.surfaces if known is not None]] = True
+    drawn.depth[~is_fitted[drawn.instance] | (drawn.rgb[..., 0] > MAX_UNCERTAINTY)] = 0
+    return drawn.depth, drawn.instance
 
 
 def _in_one_walk(
@@ -248,14 +257,10 @@ def _tell_apart(
     scene: Scene,
     moment: Moment,
     images: CameraImages,
-    lidar: CameraImages | None,
+    lidar: tuple[NDArray[np.float32], NDArray[np.uint16]],
     boxes: Sequence[ObjectBox],
 ) -> None:
     """Write the semantic image; depths become those of LiDAR surfaces, shadows become ground."""
-    if lidar is not None:
-        for instance_id, (_, own) in images.alone.items():
-            _, measured = lidar.alone[instance_id]
-            np.copyto(own, measured, where=(own > 0) & (measured > 0))
     tell_apart(
         images.depth,
         images.instance,
@@ -265,7 +270,7 @@ def _tell_apart(
         bodies_of(boxes),
         classes_of(moment.instances),
         UNLABELED if scene.sky is None else SKY,
-        NO_LIDAR if lidar is None else (lidar.depth, lidar.instance),
+        lidar,
         *scene.ground.grid,
     )
 

@@ -28,7 +28,7 @@ pixels of an object outside its body are background behind it.
 """
 
 AROUND = 1.0
-"""Distance from a box up to which LiDAR surfaces decide between an object and the ground [m]."""
+"""Margin around a box in which LiDAR surfaces decide between the object and the ground [m]."""
 
 TYRE = 0.24
 """Width of the wheels, from the sides of the box inwards [m]."""
@@ -156,10 +156,10 @@ def shows_surface(
 
 
 @func(inline="always")
-def is_under(body: Any, x: float, y: float, z: float) -> bool:
-    """Whether a point of the world is above or below a body's box or AROUND it, sideways.
+def near_footprint(body: Any, x: float, y: float, z: float) -> bool:
+    """Whether a point of the world is above or below a body's footprint, extended by AROUND.
 
-    Beams through windows hit the ground farther away.
+    The ground that beams hit through a vehicle's windows is farther away.
     """
     a = body[0] * x + body[1] * y + body[2] * z + body[3]
     b = body[4] * x + body[5] * y + body[6] * z + body[7]
@@ -173,7 +173,7 @@ def tell_apart(
     """Write the semantic image, and correct depth and instance image; shadows of objects become
     ground.
 
-    A pixel of an object shows its shadow where LiDAR surfaces are ground below or about the object.
+    A pixel of an object shows its shadow where LiDAR surfaces are ground near its footprint.
     Where they are the same object, they also give its depth. Elsewhere the object's body decides.
 
     Args:
@@ -214,7 +214,7 @@ def tell_apart(
                     x, y = measured * across + rays[0, 3], measured * along + rays[1, 3]
                     z = measured * slope + rays[2, 3]
                     above = z - height_over(heights, x0, y0, per_cell, x, y)
-                    shadow = abs(above) < TOLERANCE and is_under(bodies[slot], x, y, z)
+                    shadow = abs(above) < TOLERANCE and near_footprint(bodies[slot], x, y, z)
                 if same or shadow:
                     d = measured
                     depth[row, column] = d

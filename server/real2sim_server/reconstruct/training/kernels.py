@@ -1,4 +1,4 @@
-"""Compiled loops of training: activations, Adam, structural similarity, lines."""
+"""Compiled loops of training: activations, Adam, structural similarity, intersections."""
 
 from __future__ import annotations
 
