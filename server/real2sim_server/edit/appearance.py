@@ -1,30 +1,26 @@
-"""Appearance of edits: ground under removed objects, contact shadows, lamps, lighting."""
+"""Appearance of edits: ground under removed objects, lamps, lighting."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Hashable, Iterable, Mapping
 from dataclasses import replace
-from functools import cache, lru_cache
+from functools import lru_cache
 from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from real2sim_proto.drive import Lamp
 
-from ..geometry import (
-    Float,
-    bottom_centres,
-    invert_transform,
-    transform_from,
-    yaw_quaternion,
-)
-from ..render.types import Instance
-from ..scene import UNSEEN, GaussianCloud, Ground, Scene
+from ..geometry import Float, invert_transform
+from ..scene import UNSEEN, GaussianCloud, Scene
 from ..scene.cloud import SH_C0
 from ..scene.coverage import LOW, MARGIN
+from ..scene.ground_fit import pull_push
+from ..scene.sunlight import Sunshine, parked_shadows
 from .state import ObjectState, ScenarioState
 
 Colour = tuple[float, float, float]
@@ -40,11 +36,14 @@ AWAY = 0.5
 RIM = 1.2
 """Width of the ground around the box that represents the ground under it [m]."""
 
-MIN_POINTS = 6
-NEIGHBOURS = 48
-"""Number of neighbours for the median colour; large enough to ignore lines and shadows next to the
-box.
-"""
+CELL = 0.08
+"""Edge of the cells from which the ground is continued [m]."""
+
+MIN_POINTS, MIN_CELLS = 6, 3
+"""Minimum number of known Gaussians, and of known cells in a strip."""
+
+SHADOW_LENGTH = 8.0
+"""Maximum length of shadows that are taken out of the ground [m]."""
 
 
 def vacated_parking(state: ScenarioState, poses: Mapping[str, Float]) -> tuple[str, ...]:
@@ -67,11 +66,23 @@ def vacated_parking(state: ScenarioState, poses: Mapping[str, Float]) -> tuple[s
     )
 
 
-def inpaint_ground(scene: Scene, background: GaussianCloud, left: Iterable[str]) -> GaussianCloud:
-    """The background with the ground coloured like its surroundings where objects ``left`` stood.
+def inpaint_ground(
+    scene: Scene,
+    background: GaussianCloud,
+    left: Iterable[str],
+    *,
+    sunshine: Sunshine | None = None,
+) -> GaussianCloud:
+    """The background with the ground continued where objects ``left`` stood, without their shadows.
 
     Gaussians inside a box and above its ground become invisible, because they belong to the object.
     Guessed colours get the uncertainty of unseen Gaussians.
+
+    Args:
+        scene: has the objects.
+        background: its background.
+        left: ids of the objects.
+        sunshine: sun of the scene; None if it casts no shadows.
 
     Raises:
         UnknownObjectError: ``scene`` has no such object.
@@ -79,10 +90,10 @@ def inpaint_ground(scene: Scene, background: GaussianCloud, left: Iterable[str])
     opacities, sh = background.opacities.clone(), background.sh.clone()
     known = background.uncertainties
     uncertainties = None if known is None else known.clone()
+    points = background.means.cpu().double().numpy()
     for object_id in left:
         parked = scene.object(object_id)
-        track = parked.trajectory
-        T_world_box = track.transform((track.start_us + track.end_us) // 2)
+        T_world_box = parked.trajectory.middle
         to_box = torch.from_numpy(invert_transform(T_world_box)).to(background.means)
         local = background.means @ to_box[:3, :3].T + to_box[:3, 3]
         half = torch.tensor(parked.size).to(local) / 2
@@ -90,9 +101,14 @@ def inpaint_ground(scene: Scene, background: GaussianCloud, left: Iterable[str])
         height = local[:, 2] + half[2]
         level = height.abs() <= LOW
         opacities[(beyond <= 0) & (height > LOW) & (local[:, 2] <= half[2])] = 0.0
+        if sunshine is not None:
+            near = (level & (beyond <= SHADOW_LENGTH)).nonzero()[:, 0]
+            shadow = parked_shadows([parked], points[near.cpu()], sunshine.sun)
+            near = near[torch.from_numpy(shadow)]
+            _relight(sh, near, points[near.cpu(), :2], sunshine)
         around = level & (beyond > MARGIN) & (beyond <= RIM) & (opacities > 0.1)
         beneath = level & (beyond <= MARGIN)
-        _recolour(sh, local[:, :2], beneath, around)
+        _continue_ground(sh, local[:, :2], beneath, around, half[:2] + MARGIN)
         if uncertainties is not None:
             uncertainties[beneath] = UNSEEN
     return replace(background, opacities=opacities, sh=sh, uncertainties=uncertainties)
@@ -110,92 +126,74 @@ def _away(pose: Float, parked: ObjectState) -> bool:
     return math.hypot(x - (low_x + high_x) / 2, y - (low_y + high_y) / 2) > AWAY
 
 
-def _recolour(sh: Tensor, places: Tensor, unknown: Tensor, known: Tensor) -> None:
-    """Set ``sh`` of the ``unknown`` [N] bool to the median of their nearest ``known``, in place."""
-    count = min(NEIGHBOURS, int(known.sum()))
-    if count < MIN_POINTS or not bool(unknown.any()):
-        return
-    distances = torch.cdist(places[unknown], places[known])
-    nearest = distances.topk(count, largest=False).indices
-    sh[unknown] = sh[known][nearest].median(dim=1).values
+def _relight(sh: Tensor, rows: Tensor, places: Float, sunshine: Sunshine) -> None:
+    """Take an object's shadow out of ``sh`` of the ground's Gaussians ``rows`` [M], in place."""
+    colours = (sh[rows, 0] * SH_C0 + 0.5).cpu().double().numpy()
+    lit = torch.from_numpy(sunshine.without_shadow(colours, places)).to(sh)
+    gain = lit / (sh[rows, 0] * SH_C0 + 0.5).clamp(min=0.01)
+    sh[rows] = sh[rows] * gain[:, None]
+    sh[rows, 0] = (lit - 0.5) / SH_C0
 
 
-# --- Contact shadows -----------------------------------------------------------------------------
+def _continue_ground(
+    sh: Tensor, places: Tensor, unknown: Tensor, known: Tensor, half: Tensor
+) -> None:
+    """Set ``sh`` of the ``unknown`` [N] bool from the ``known`` around a rectangle, in place.
 
-# Shadows of recorded objects are part of the background. Edited objects share one cloud of flat
-# dark Gaussians, scaled to each footprint.
-
-SHADOW_MARGIN = 0.35
-"""The shadow reaches this far beyond the footprint [m], fading."""
-
-LIFT = 0.04
-"""Height above the ground [m], in front of the ground's own Gaussians."""
-
-DARKNESS = 0.22
-"""Opacity of each Gaussian in full shadow. About three overlap at any point: half the light."""
-
-FADE_HEIGHT = 1.0
-"""Objects this high above the ground cast no contact shadow [m]."""
-
-LEVELS = 8
-"""Shades between none and full."""
-
-CELLS = (20, 12)
-COLOUR = (0.02, 0.02, 0.025)
-
-
-def contact_shadow(
-    T_world_object: Float,
-    size: tuple[float, float, float],
-    ground: Ground,
-    *,
-    device: torch.device,
-) -> Instance | None:
-    """The shadow of a box; None if the box is too far above the ground.
+    Opposite sides are joined by straight lines along the axis on which they look more alike, so
+    that kerbs and markings go on. What still differs at the border fades inwards; it makes nothing
+    brighter than 95 % of the ground around.
 
     Args:
-        T_world_object: [4, 4] float64 pose of the box centre.
-        size: (length, width, height) [m].
-        ground: ground below the box.
-        device: device of the shadow's Gaussians.
+        sh: [N, K, 3].
+        places: [N, 2] in the frame of the rectangle [m].
+        unknown: Gaussians in the rectangle.
+        known: Gaussians around it.
+        half: [2], half of the sides of the rectangle [m].
     """
-    bottom = bottom_centres(T_world_object[None], size)[0]
-    height = ground.height(float(bottom[0]), float(bottom[1]))
-    clearance = max(0.0, float(bottom[2]) - height)
-    level = round(LEVELS * (1 - clearance / FADE_HEIGHT))
-    if level <= 0:
-        return None
-    forward = T_world_object[:3, 0]
-    yaw = np.arctan2(forward[1], forward[0])
-    level_ground = transform_from([bottom[0], bottom[1], height + LIFT], yaw_quaternion(float(yaw)))
-    footprint = (size[0] + 2 * SHADOW_MARGIN, size[1] + 2 * SHADOW_MARGIN, 1.0)
-    return Instance(_decal(level, str(device)), level_ground, instance_id=0, scale=footprint)
+    if int(known.sum()) < MIN_POINTS or not bool(unknown.any()):
+        return
+    from scipy.ndimage import map_coordinates
+
+    sides = half.cpu().double().numpy()
+    low = -sides - RIM
+    shape = tuple(np.ceil(-2 * low / CELL).astype(int))
+    at = np.floor((places[known].cpu().double().numpy() - low) / CELL).astype(int)
+    cells = np.ravel_multi_index(at.clip(0, np.array(shape) - 1).T, shape)
+    colours = (sh[known, 0] * SH_C0 + 0.5).clamp(0, 1).cpu().double().numpy()
+    counts = np.bincount(cells, minlength=shape[0] * shape[1]).reshape(shape)
+    sums = [np.bincount(cells, colours[:, c], shape[0] * shape[1]) for c in range(3)]
+    mean = np.stack(sums, -1).reshape(*shape, 3) / counts.clip(1)[..., None]
+    joined = [_join(mean, counts > 0, axis, sides[axis]) for axis in (0, 1)]
+    lines, _ = min(joined, key=lambda pair: pair[1])
+    rest = np.where((counts > 0)[..., None], mean - lines, 0).astype(np.float32)
+    guess = lines + pull_push(rest, np.minimum(counts, 1).astype(np.float32))
+    guess = np.minimum(guess, np.maximum(lines, np.quantile(colours, 0.95, axis=0)))
+    at = (places[unknown].cpu().double().numpy() - low) / CELL - 0.5
+    found = [map_coordinates(guess[..., c], at.T, order=1, mode="nearest") for c in range(3)]
+    colour = np.stack(found, axis=1)
+    sh[unknown] = 0
+    sh[unknown, 0] = torch.from_numpy((colour - 0.5) / SH_C0).to(sh)
 
 
-@cache
-def _decal(level: int, device: str) -> GaussianCloud:
-    """A unit square of flat Gaussians, darkest in the middle and invisible at the rim."""
-    columns, rows = CELLS
-    x, y = np.meshgrid(
-        (np.arange(columns) + 0.5) / columns - 0.5,
-        (np.arange(rows) + 0.5) / rows - 0.5,
-        indexing="ij",
-    )
-    inside = np.clip((0.5 - np.maximum(np.abs(x), np.abs(y))) / 0.2, 0.0, 1.0)
-    corner = np.clip((0.62 - np.hypot(x, y)) / 0.2, 0.0, 1.0)
-    shade = (inside * inside * (3 - 2 * inside) * corner).ravel()
-    count = len(shade)
-    means = np.stack([x.ravel(), y.ravel(), np.zeros(count)], axis=1)
-    spread = [0.7 / columns, 0.7 / rows, 0.004]
-    colour = (torch.tensor(COLOUR) - 0.5) / SH_C0
-    decal = GaussianCloud(
-        means=torch.from_numpy(means).float(),
-        quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
-        scales=torch.tensor(spread).repeat(count, 1),
-        opacities=torch.from_numpy(shade * DARKNESS * level / LEVELS).float(),
-        sh=colour.expand(count, 1, 3).contiguous(),
-    )
-    return decal.to(device)
+def _join(mean: Float, known: NDArray[np.bool_], axis: int, half: float) -> tuple[Float, float]:
+    """Colours [X, Y, 3] joined between both ends of an axis, and how much the ends differ."""
+    mean, known = np.moveaxis(mean, axis, 0), np.moveaxis(known, axis, 0)
+    along = (np.arange(len(mean)) + 0.5) * CELL - half - RIM
+    ends = []
+    for end in (along < -half, along > half):
+        seen = np.where(known[end][..., None], mean[end], np.nan)
+        enough = known[end].sum(axis=0) >= MIN_CELLS
+        seen[:, ~enough] = 0
+        strip = np.nanmedian(seen, axis=0).astype(np.float32)
+        filled = pull_push(strip[None], enough[None].astype(np.float32))[0]
+        ends.append((filled, enough))
+    (first, a), (last, b) = ends
+    share = np.clip((along + half) / (2 * half), 0, 1)[:, None, None]
+    joined = np.moveaxis(first * (1 - share) + last * share, 0, axis)
+    both = a & b
+    differ = float(np.abs(first - last)[both].mean()) if both.any() else np.inf
+    return joined, differ
 
 
 # --- Lamps ---------------------------------------------------------------------------------------

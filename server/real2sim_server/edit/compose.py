@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import threading
-from collections import OrderedDict
-from collections.abc import Callable, Hashable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from types import MappingProxyType
-from typing import Literal, TypeVar
-from weakref import WeakKeyDictionary
+from typing import Literal
 
 import numpy as np
 import torch
@@ -25,14 +22,15 @@ from ..render.lens import TOLERANCE
 from ..render.types import Instance
 from ..scene import Figure, GaussianCloud, Lidar, Scene, Stride, Trajectory
 from ..scene.cloud import SH_C0
-from .appearance import contact_shadow, inpaint_ground, lamp_cloud, vacated_parking
+from ..scene.sunlight import sunshine_of
+from .appearance import inpaint_ground, lamp_cloud, vacated_parking
+from .light import Recent, cast_shadow, shaded
 from .motion import require_object
 from .state import ObjectState, ScenarioState
 from .tracks import PlacedObjects
 
-T = TypeVar("T")
-
 NO_STRIDES: Mapping[str, Stride] = MappingProxyType({})
+NO_POSES: Mapping[str, Float] = MappingProxyType({})
 KEPT_BACKGROUNDS = 4
 """Number of cached backgrounds with erased regions per scene; each costs 4 bytes per Gaussian, and
 its colours as well if parked objects were moved.
@@ -40,9 +38,10 @@ its colours as well if parked objects were moved.
 
 
 def instances_at(scene: Scene, state: ScenarioState, t_us: int) -> list[Instance]:
-    """The background, every visible object at ``t_us``, and contact shadows, in this order.
+    """The background, every visible object at ``t_us``, and shadows, in this order.
 
-    Objects placed by edits get contact shadows. Parts that do not depend on time are cached.
+    Edited objects get shadows and the light of their place. Parts that do not depend on time are
+    cached.
 
     Args:
         scene: scene with the Gaussians; ``state`` must be made from it.
@@ -76,7 +75,7 @@ def compose(
         instances.append(_standing(scene, subject, transform, t_us, stride=stride))
         if subject.edited:
             edited.append((subject, transform))
-    return instances + contact_shadows(scene, edited, t_us)
+    return instances + cast_shadows(scene, edited, t_us)
 
 
 def instances_of(
@@ -106,24 +105,48 @@ def instances_at_start(scene: Scene, state: ScenarioState) -> list[Instance]:
     placed = state.tracks.at(scene.start_us)
     poses = {o.object_id: T for o, T in zip(placed.objects, placed.transforms, strict=True)}
     background = Instance(composed_background(scene, state, poses))
-    return [background, *_anywhere(scene, state.tracks.objects)]
+    return [background, *_anywhere(scene, state.tracks.objects, poses)]
 
 
-def _anywhere(scene: Scene, objects: Iterable[ObjectState]) -> Iterable[Instance]:
-    nowhere = transform_from(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
-    return (_standing(scene, subject, nowhere, scene.start_us) for subject in objects)
+def _anywhere(
+    scene: Scene, objects: Iterable[ObjectState], poses: Mapping[str, Float] = NO_POSES
+) -> Iterable[Instance]:
+    """Objects in the light of their ``poses``, or as recorded without one."""
+    return (
+        _standing(scene, subject, poses.get(subject.object_id), scene.start_us)
+        for subject in objects
+    )
 
 
 def _standing(
-    scene: Scene, subject: ObjectState, transform: Float, t_us: int, *, stride: Stride | None = None
+    scene: Scene,
+    subject: ObjectState,
+    transform: Float | None,
+    t_us: int,
+    *,
+    stride: Stride | None = None,
 ) -> Instance:
-    placement = (transform, subject.instance_id, subject.scale)
+    placed = np.eye(4) if transform is None else transform
+    placement = (placed, subject.instance_id, subject.scale)
     semantic = semantic_class(subject.category)
     cloud = _posed(scene, subject, t_us, stride)
     if subject.asset is not None:
         return Instance(cloud, *placement, semantic=semantic)
-    colour = scene.object(subject.source_id).colour
+    recorded = scene.object(subject.source_id)
+    colour = recorded.colour
+    sunshine = sunshine_of(scene) if subject.edited and cloud is recorded.cloud else None
+    if sunshine is not None and transform is not None:
+        track = recorded.trajectory
+        there = track.transform(min(max(t_us, track.start_us), track.end_us))
+        lit = sunshine.lit(there[None, :2, 3])[0] if colour else sunshine.lit_along(track)
+        was = _heading(there), float(lit)
+        now = _heading(transform), float(sunshine.lit(transform[None, :2, 3])[0])
+        cloud, colour = shaded(cloud, colour, was, now, sunshine)
     return Instance(cloud, *placement, colour=colour, t_us=t_us, semantic=semantic)
+
+
+def _heading(transform: Float) -> float:
+    return float(np.arctan2(transform[1, 0], transform[0, 0]))
 
 
 def lamps_on(
@@ -134,21 +157,26 @@ def lamps_on(
     Raises:
         UnknownObjectError: ``subject`` is of another scene.
     """
-    asset = subject.asset
-    body = scene.object(subject.source_id).cloud if asset is None else asset.cloud_in(scene)
-    light = lamp_cloud(body, subject.scale, subject.scaled_size, lamps)
+    light = lamp_cloud(_body(scene, subject), subject.scale, subject.scaled_size, lamps)
     return replace(shown, cloud=light, scale=(1.0, 1.0, 1.0), covars=None, colour=None)
 
 
-def contact_shadows(
+def cast_shadows(
     scene: Scene, placed: Iterable[tuple[ObjectState, Float]], t_us: int
 ) -> list[Instance]:
-    """Contact shadows of objects, given with their ``T_world_object``.
+    """Shadows of objects, given with their ``T_world_object``.
 
     Objects at their recorded pose at ``t_us`` are omitted: their shadow is in the background.
     """
     shadows = [
-        contact_shadow(transform, subject.scaled_size, scene.ground, device=scene.background.device)
+        cast_shadow(
+            transform,
+            _body(scene, subject),
+            subject.scale,
+            subject.scaled_size,
+            scene.ground,
+            sunshine=sunshine_of(scene),
+        )
         for subject, transform in placed
         if not _as_recorded(scene, subject, transform, t_us)
     ]
@@ -172,9 +200,13 @@ def cloud_of(
     return cloud if colour is None else colour.at(cloud, t_us)
 
 
-def _posed(scene: Scene, subject: ObjectState, t_us: int, stride: Stride | None) -> GaussianCloud:
+def _body(scene: Scene, subject: ObjectState) -> GaussianCloud:
     asset = subject.asset
-    cloud = scene.object(subject.source_id).cloud if asset is None else asset.cloud_in(scene)
+    return scene.object(subject.source_id).cloud if asset is None else asset.cloud_in(scene)
+
+
+def _posed(scene: Scene, subject: ObjectState, t_us: int, stride: Stride | None) -> GaussianCloud:
+    cloud = _body(scene, subject)
     figure = figure_of(scene, subject)
     if figure is None:
         return cloud
@@ -209,10 +241,13 @@ def composed_background(
         return scene.background
 
     def make() -> GaussianCloud:
-        background = inpaint_ground(scene, scene.background, left) if left else scene.background
+        background = scene.background
+        if left:
+            sunshine = sunshine_of(scene)
+            background = inpaint_ground(scene, background, left, sunshine=sunshine)
         return without_regions(background, erased) if erased else background
 
-    return kept(scene, (erased, left), make)
+    return _backgrounds.get(scene, (erased, left), make)
 
 
 def without_regions(background: GaussianCloud, erased: tuple[EraseRegion, ...]) -> GaussianCloud:
@@ -238,20 +273,7 @@ def _as_recorded(scene: Scene, subject: ObjectState, transform: Float, t_us: int
     return bool(abs(recorded.transform(t_us) - transform).max() < 0.02)
 
 
-_derived: WeakKeyDictionary[Scene, OrderedDict[Hashable, object]] = WeakKeyDictionary()
-_deriving = threading.Lock()
-
-
-def kept(scene: Scene, key: Hashable, make: Callable[[], T]) -> T:
-    """The cached result of ``make`` for ``scene``."""
-    with _deriving:
-        made = _derived.setdefault(scene, OrderedDict())
-        if key not in made:
-            made[key] = make()
-        made.move_to_end(key)
-        while len(made) > KEPT_BACKGROUNDS:
-            made.popitem(last=False)
-        return made[key]  # type: ignore[return-value]
+_backgrounds: Recent[Scene, GaussianCloud] = Recent(KEPT_BACKGROUNDS)
 
 
 # --- Free poses ----------------------------------------------------------------------------------
@@ -342,7 +364,8 @@ def targets_at(
     """
     cloud, attributes = lidar_target(scene, None)
     if state.erased:
-        cloud = kept(scene, ("lidar", state.erased), lambda: without_regions(cloud, state.erased))
+        key = ("lidar", state.erased)
+        cloud = _backgrounds.get(scene, key, lambda: without_regions(cloud, state.erased))
     found = [(Instance(cloud), attributes)]
     for subject, transform in zip(placed.objects, placed.transforms, strict=True):
         own, known = _object_cloud(scene, subject, t_us, strides.get(subject.object_id))

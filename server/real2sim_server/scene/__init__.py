@@ -24,6 +24,7 @@ from .lens import BrownConrady, Fisheye, FTheta, Lens, Omnidirectional
 from .lidar_surfaces import LidarSurfaces, Reflector, RingResponse
 from .range_sensors import Beams, Detection, Lidar, Radar
 from .scene import Scene, SceneObject, Sky
+from .sunlight import Sunlight
 from .trajectory import Trajectory
 
 __all__ = [
@@ -66,6 +67,7 @@ __all__ = [
     "Sky",
     "StopLine",
     "Stride",
+    "Sunlight",
     "TimeColour",
     "TimeOutOfRangeError",
     "Trajectory",

@@ -23,6 +23,7 @@ from .ground import Ground, of_bundle
 from .ground_fit import fit_scene_ground
 from .lane_graph import LaneGraph
 from .lidar_surfaces import LidarSurfaces
+from .sunlight import Sunlight
 from .trajectory import Trajectory
 
 # Sky.
@@ -264,6 +265,7 @@ class Scene:
         stored_ground: fitted by the reconstruction, or None. Use :attr:`ground` instead.
         lidar: Gaussians for LiDARs, or None: LiDARs see the same Gaussians as cameras.
         lanes: lanes of its roads, from a map or the log, or None.
+        sunlight: sun of the drive; None if unknown or under an overcast sky.
     """
 
     name: str
@@ -279,6 +281,7 @@ class Scene:
     stored_ground: Ground | None = field(default=None, repr=False)
     lidar: LidarSurfaces | None = field(default=None, repr=False)
     lanes: LaneGraph | None = field(default=None, repr=False)
+    sunlight: Sunlight | None = None
 
     def __post_init__(self) -> None:
         if len(self.objects) > MAX_OBJECTS:

@@ -111,6 +111,11 @@ class Trajectory:
         """Whether it moves, see :func:`leads_anywhere`."""
         return leads_anywhere(self.positions)
 
+    @property
+    def middle(self) -> Float:
+        """``T_world_object`` [4, 4] in the middle of the time span."""
+        return self.transform((self.start_us + self.end_us) // 2)
+
     def covers(self, t_us: int) -> bool:
         """Whether a pose is known at ``t_us``."""
         return self.start_us <= t_us <= self.end_us

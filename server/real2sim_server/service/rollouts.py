@@ -28,7 +28,7 @@ from real2sim_proto.operations import (
 )
 
 from ..edit import ObjectState, ScenarioState
-from ..edit.compose import composed_background, contact_shadows
+from ..edit.compose import cast_shadows, composed_background
 from ..geometry import Float, quaternion_to_matrix, transform_from
 from ..physics.colliders import (
     Box,
@@ -267,7 +267,7 @@ class RolloutPlayback:
         self.span = (result.start_us, self._playback.time_us(result.frames - 1))
 
     def instances(self, t_us: int, *, aboard: bool = True) -> Sequence[Instance]:
-        """Instances at the stored frame nearest to ``t_us`` [us], with contact shadows.
+        """Instances at the stored frame nearest to ``t_us`` [us], with shadows of edited objects.
 
         Args:
             t_us: time [us].
@@ -289,7 +289,7 @@ class RolloutPlayback:
             for subject, pose in standing
             if subject.edited or subject.object_id in self._result.objects
         ]
-        return [background, *objects, *contact_shadows(self._scene, placed, t_us)]
+        return [background, *objects, *cast_shadows(self._scene, placed, t_us)]
 
     def _pose(self, subject: ObjectState, frame: int, t_us: int) -> Float:
         simulated = self._result.objects.get(subject.object_id)

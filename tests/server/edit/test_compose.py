@@ -94,8 +94,9 @@ def test_a_moved_object_casts_a_shadow_of_its_footprint(street):
     moved = apply_operations(state, [Translate(object_id="parked", x=-6, y=-3)]).state
     (shadow,) = shadows(instances_at(street, moved, 0))
 
-    np.testing.assert_allclose(shadow.T_world_object[:3, 3], [14, 2, 0.04], atol=0.02)
-    np.testing.assert_allclose(shadow.scale, [4.7, 2.7, 1.0])
+    places = shadow.cloud.means.numpy() + shadow.T_world_object[:3, 3]
+    np.testing.assert_allclose(places.min(axis=0), [11.7, 0.7, 0.03], atol=0.25)
+    np.testing.assert_allclose(places.max(axis=0), [16.3, 3.3, 0.03], atol=0.25)
 
 
 def test_an_object_moved_back_has_no_added_shadow(street):

@@ -178,7 +178,7 @@ class _Instances:
             raise SceneError("a rotation has length zero")
         poses = transform_from(self.positions[frames, instance], self.quats[frames, instance])
         path = Trajectory.from_transforms(times_us[frames], poses)
-        middle = path.transform((path.start_us + path.end_us) // 2)
+        middle = path.middle
         cloud = tied_to_object(self.cloud.select(torch.from_numpy(mine)), middle[:3, :3])
         length, width, height = self.sizes[instance].tolist()
         return SceneObject(

@@ -408,7 +408,7 @@ def _objects(
     objects: dict[str, SceneObject] = {}
     for track, trajectory in trajectories.items():
         cloud = _cloud(file, state, model_name(track), fourier_scale)
-        middle = trajectory.transform((trajectory.start_us + trajectory.end_us) // 2)
+        middle = trajectory.middle
         category = CATEGORIES.get(tracks.classes[track], tracks.classes[track])
         object_id = f"{category}_{track}"
         objects[object_id] = SceneObject(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from ...maps import laid_on, lanes_of_log
 from ...scene import GaussianCloud, Ground, Scene, SceneObject, Sky
 from ...scene.cloud import SH_C0
 from ...scene.ground_fit import DrivenPath, GroundFit, box_bottoms, fit_ground
+from ...scene.sunlight import Sunlight, Sunshine, parked_shadows
 from ..logged_view import sky_mask
 from ..options import InitialiseOptions, OnProgress, ReconstructError, Stages
 from .accumulate import (
@@ -31,6 +33,7 @@ from .accumulate import (
     voxel_levels,
     well_supported,
 )
+from .sunlight import fit_sunlight
 from .surfels import (
     ColourPrior,
     Surfels,
@@ -54,7 +57,7 @@ from .vehicle_body import (
     mirrored,
     underside,
 )
-from .vehicle_parts import LIGHT, PARTS, pose_amid
+from .vehicle_parts import LIGHT, PARTS, Light
 from .views import PlacedSurfels, ProjectedView, SkySamples, chosen_frames, gather_views
 
 OPACITY = 0.95
@@ -171,14 +174,16 @@ def initialise_scene(
         parts = _keep_real_walls(log, parts, options, report_step)
     with stages("colour") as report_step:
         colours, known, sky_samples = _sample_colours(log, parts, options, report_step)
+    with stages("sunlight"):
+        sunlight = fit_sunlight(log, fitted.ground)
     with stages("fill"):
-        colours, look = _inpaint(log, parts, fitted.surface, colours, known)
+        colours, look = _inpaint(log, parts, fitted.surface, colours, known, sunlight=sunlight)
         sky = sky_samples.finish(_median_colour(colours[: parts.ground_count]))
     scene = _assemble(log, parts, colours, sky, {**look, "options": asdict(options)})
     lanes = lanes_of_log(log, source=options.lanes)
     if lanes is not None:
         lanes = laid_on(lanes, fitted.ground)
-    return replace(scene, stored_ground=fitted.ground, lanes=lanes)
+    return replace(scene, stored_ground=fitted.ground, lanes=lanes, sunlight=sunlight)
 
 
 def _fit_ground(
@@ -359,6 +364,8 @@ def _inpaint(
     surface: Ground,
     colours: NDArray[np.float32],
     known: NDArray[np.bool_],
+    *,
+    sunlight: Sunlight | None,
 ) -> tuple[NDArray[np.float32], dict[str, Any]]:
     """Colours [N, 3] of all Gaussians, and shared values of vehicles: light, part colours."""
     points, filled = parts.surfels.points, colours.copy()
@@ -372,11 +379,20 @@ def _inpaint(
     filled[structure] = fill_from_neighbours(
         points[structure], colours[structure], known[structure], prior.colour(height, intensity)
     )
-    return _inpaint_objects(log, parts, filled, known)
+    sunshine = None
+    if sunlight is not None:
+        places, shown = points[ground].astype(np.float64), known[ground]
+        shown = shown & ~parked_shadows(log.tracks, places, sunlight)
+        sunshine = Sunshine(sunlight, places[shown, :2], colours[ground][shown])
+    return _inpaint_objects(log, parts, filled, known, sunshine)
 
 
 def _inpaint_objects(
-    log: DrivingLog, parts: _SurfelSet, colours: NDArray[np.float32], known: NDArray[np.bool_]
+    log: DrivingLog,
+    parts: _SurfelSet,
+    colours: NDArray[np.float32],
+    known: NDArray[np.bool_],
+    sunshine: Sunshine | None,
 ) -> tuple[NDArray[np.float32], dict[str, Any]]:
     """Fill the unseen body of each object from its seen part, then its underside, in place.
 
@@ -396,6 +412,7 @@ def _inpaint_objects(
     frames = chosen_frames(log, FACED_FRAMES)
     closed: list[int] = []
     surfaces: list[VehicleSurface] = []
+    lights: list[Light] = []
     for k, (track, mine, body) in enumerate(zip(log.tracks, members, parts.bodies, strict=True)):
         if body is not None:
             closed.append(k)
@@ -403,11 +420,14 @@ def _inpaint_objects(
             nearest = body.nearest(places)
             # A side seen edge-on shows the colours of the background next to its outline.
             seen = known[mine] & faced(log, track, places, body.normals[nearest], frames)
-            normals = body.unit_normals()[nearest] @ pose_amid(track.trajectory)[:3, :3].T
+            normals = body.unit_normals()[nearest] @ track.trajectory.middle[:3, :3].T
             surfaces.append(
                 VehicleSurface(parts.surfels.points[mine], normals, colours[mine], seen, body)
             )
-    filled, light, palette = fill_vehicles(surfaces)
+            if sunshine is not None:
+                lit = sunshine.lit_along(track.trajectory)
+                lights.append(partial(sunshine.brightness, lit=lit))
+    filled, light, palette = fill_vehicles(surfaces, lights or None)
     for k, found in zip(closed, filled, strict=True):
         colours[members[k]] = found
     for mine, body in zip(members, parts.bodies, strict=True):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from ...synthetic.vehicles import CARGO_FLOOR, SHAPES, VehicleShape, build_vehic
 from .accumulate import PointSet
 from .surfels import GREY, Surfels, fill_from_mirror, modal_colour
 from .vehicle_parts import (
+    Light,
     Part,
     brightness,
     fit_light,
@@ -158,7 +159,7 @@ def body_colours(
     points: NDArray[np.float32],
     colours: NDArray[np.float32],
     *,
-    light: Float,
+    light: Light,
     palette: NDArray[np.float32],
 ) -> NDArray[np.float32]:
     """Colours [B, 3] of the points of a body under the given light.
@@ -167,11 +168,11 @@ def body_colours(
         points: [N, 3] of a vehicle in that box, from stage 0.
         colours: [N, 3] of these points. The most common colour of painted points, with the light
         removed, becomes the paint. A truck's cargo is handled likewise.
-        light: slopes [3] in the frame of the box, see :func:`.vehicle_parts.fit_light`.
+        light: light on it, for normals in the frame of the box.
         palette: colours [10, 3] of parts, see :func:`.vehicle_parts.fit_palette`.
     """
     distance, nearest = body.closest(points)
-    lit = brightness(light, body.unit_normals())
+    lit = light(body.unit_normals())
     # Points far from the body belong to the dark plate under it.
     near = distance < PAINT_REACH
     plain = colours / lit[nearest]
@@ -487,9 +488,11 @@ class VehicleSurface:
 
 
 def fill_vehicles(
-    surfaces: Sequence[VehicleSurface],
+    surfaces: Sequence[VehicleSurface], lights: Sequence[Light] | None = None
 ) -> tuple[list[NDArray[np.float32]], Float, NDArray[np.float32]]:
     """Colours [N, 3] of each vehicle's points, and the shared light [3] and palette [10, 3].
+
+    ``lights`` are the light on each vehicle, for normals in the world; None for the shared light.
 
     Seen colours do not change. A vehicle with almost no seen paint becomes grey, with the median
     brightness of the others.
@@ -499,37 +502,39 @@ def fill_vehicles(
         [s.normals[mine] for s, mine in zip(surfaces, painted, strict=True)],
         [s.colours[mine] for s, mine in zip(surfaces, painted, strict=True)],
     )
-    paints = [_shown_paints(s, light) for s in surfaces]
-    palette = _shown_palette(surfaces, light)
+    shared: list[Light] = [partial(brightness, light)] * len(surfaces)
+    lit = [on(s.normals) for s, on in zip(surfaces, lights or shared, strict=True)]
+    paints = [_shown_paints(s, on) for s, on in zip(surfaces, lit, strict=True)]
+    palette = _shown_palette(surfaces, lit)
     found = [p[Part.PAINT] for p in paints if Part.PAINT in p]
     usual = np.full(3, np.median(np.mean(found, axis=1)), np.float32) if found else GREY
     filled = [
-        _filled(s, light, with_paints(palette, mine, usual))
-        for s, mine in zip(surfaces, paints, strict=True)
+        _filled(s, on, with_paints(palette, mine, usual))
+        for s, on, mine in zip(surfaces, lit, paints, strict=True)
     ]
     return filled, light, palette
 
 
-def _shown_paints(surface: VehicleSurface, light: Float) -> dict[Part, NDArray[np.float32]]:
+def _shown_paints(
+    surface: VehicleSurface, lit: NDArray[np.float32]
+) -> dict[Part, NDArray[np.float32]]:
     seen = surface.seen
-    return shown_paints(
-        surface.parts()[seen], surface.colours[seen] / brightness(light, surface.normals[seen])
-    )
+    return shown_paints(surface.parts()[seen], (surface.colours / lit)[seen])
 
 
-def _shown_palette(surfaces: Sequence[VehicleSurface], light: Float) -> NDArray[np.float32]:
+def _shown_palette(
+    surfaces: Sequence[VehicleSurface], lit: Sequence[NDArray[np.float32]]
+) -> NDArray[np.float32]:
     parts, colours = [], []
-    for surface in surfaces:
+    for surface, on in zip(surfaces, lit, strict=True):
         parts.append(surface.parts(reach=ON_PART)[surface.seen])
-        lit = brightness(light, surface.normals[surface.seen])
-        colours.append(surface.colours[surface.seen] / lit)
+        colours.append((surface.colours / on)[surface.seen])
     return fit_palette(parts, colours)
 
 
 def _filled(
-    surface: VehicleSurface, light: Float, palette: NDArray[np.float32]
+    surface: VehicleSurface, lit: NDArray[np.float32], palette: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    lit = brightness(light, surface.normals)
     mirrored, known = fill_from_mirror(surface.points, surface.colours / lit, surface.seen)
     own = surface.body.colours(palette)[surface.closest[1]]
     plain = np.where((surface.parts() != Part.PAINT)[:, None], own, palette[Part.PAINT])

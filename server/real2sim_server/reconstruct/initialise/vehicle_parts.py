@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...geometry import Float
-from ...scene import SceneObject, Trajectory
+from ...scene import Scene, SceneObject
+from ...scene.sunlight import sunshine_of
 from ...synthetic.vehicles import VehicleShape, roof_heights
 from .surfels import MIN_OBSERVED, modal_colour
+
+Colours = NDArray[np.float32]
+Light = Callable[[Float], Colours]
+"""Brightness [N, 1] or [N, 3] of paint on surfaces with unit normals [N, 3]."""
 
 # Shading: paint is brighter where it faces the sun and the sky.
 #
@@ -65,20 +70,20 @@ def brightness(light: Float, normals: Float) -> NDArray[np.float32]:
     return np.exp(normals @ light)[:, None].astype(np.float32)
 
 
-def light_on(item: SceneObject, reconstruction: object) -> Float:
-    """The slopes [3] in the frame of an object, at its pose in the middle of its time span.
+def light_on(item: SceneObject, scene: Scene) -> Light:
+    """The light on an object of ``scene``, for normals in its frame at its middle pose.
 
-    Args:
-        reconstruction: entry of the scene's provenance; without slopes, light is from above.
+    That of the sun, if it is known, otherwise the fitted slopes.
     """
+    sunshine = sunshine_of(scene)
+    axes = item.trajectory.middle[:3, :3]
+    if sunshine is not None:
+        lit = sunshine.lit_along(item.trajectory)
+        return lambda normals: sunshine.brightness(normals @ axes.T, lit)
+    reconstruction = scene.provenance.get("reconstruction")
     known = reconstruction.get(LIGHT) if isinstance(reconstruction, dict) else None
-    light = np.array(FROM_ABOVE if known is None else known, dtype=np.float64)
-    return np.asarray(light @ pose_amid(item.trajectory)[:3, :3])
-
-
-def pose_amid(trajectory: Trajectory) -> Float:
-    """``T_world_object`` [4, 4] in the middle of the time span, the reference for the light."""
-    return trajectory.transform((trajectory.start_us + trajectory.end_us) // 2)
+    slopes = np.array(FROM_ABOVE if known is None else known, dtype=np.float64)
+    return lambda normals: brightness(slopes, normals @ axes.T)
 
 
 # Parts and colours.
@@ -94,7 +99,6 @@ FRAME = 0.035
 """Width of the dark frame about side windows [m]."""
 PILLAR = 0.05
 """Half the width of a pillar between side windows [m]."""
-Colours = NDArray[np.float32]
 
 
 class Part(IntEnum):
@@ -257,6 +261,8 @@ def _set_ends(  # noqa: PLR0917
     parts[nose & (side < 0.42) & (np.abs(z - lamp + 0.02) < 0.08)] = Part.TRIM
     outer = (side > width / 2 - 0.52) & (side < width / 2 - 0.1)
     parts[nose & outer & (np.abs(z - lamp) < 0.08)] = Part.WHITE_LAMP
+    intake = np.abs(z - shape.clearance - 0.14) < 0.06
+    parts[nose & intake & (side < 0.3 * width)] = Part.TRIM
     parts[nose & (side < 0.26) & (np.abs(z - lamp + 0.21) < 0.055)] = Part.PLATE
     tail = (nx < -0.35) & (x < 0.4 - length / 2) & (z < max(shape.belt, 0.7 * height))
     low, high, inner = shape.belt - 0.33, shape.belt - 0.12, width / 2 - 0.42

@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from ...geometry import Float, matrix_to_quaternion
+from ...geometry import matrix_to_quaternion
 from ...scene import GaussianCloud, SceneObject
 from ...scene.cloud import SH_C0
 from ..initialise.vehicle_body import SPACING, VehicleBody, body_colours
-from ..initialise.vehicle_parts import light_on, palette_of
+from ..initialise.vehicle_parts import Light, light_on, palette_of
 from . import kernels
 from .densify import SelectiveAdam, rotation_matrices
 from .gaussians import FIELDS, OBJECT_FIELDS
@@ -46,8 +46,9 @@ SHADOW = 0.3
 INSETS = (1.0, 0.96, 0.92, 0.87, 0.82)
 """Factors by which a body may be narrower and lower where images show it beyond the vehicle's
 outline."""
-DISC = (0.7, 0.7, 0.15)
-"""Standard deviation of a body's Gaussians, relative to their spacing."""
+DISC, BENT = (0.7, 0.7, 0.15), (0.5, 0.5, 0.15)
+"""Standard deviation of a body's Gaussians relative to their spacing, on flat and bent surfaces.
+Larger ones at bends reach beyond the outline."""
 
 
 @torch.no_grad()
@@ -92,7 +93,7 @@ def offer_bodies(
     for index, (name, item) in enumerate(scene.objects.items()):
         body, insets = bodies[index], INSETS if followed[index] else INSETS[:1]
         if body is not None:
-            light = light_on(item, reconstruction)
+            light = light_on(item, scene)
             cloud = body_cloud(body, item, light=light, palette=palette, insets=insets)
             objects[name] = replace(item, cloud=cloud)
             alternatives.append(torch.arange(len(cloud) // len(insets)).repeat(len(insets)))
@@ -107,7 +108,7 @@ def body_cloud(
     body: VehicleBody,
     item: SceneObject,
     *,
-    light: Float,
+    light: Light,
     palette: NDArray[np.float32],
     insets: Sequence[float],
 ) -> GaussianCloud:
@@ -117,14 +118,16 @@ def body_cloud(
 
     Args:
         item: object of stage 0.
-        light: slopes [3] in its frame, see :func:`.vehicle_parts.fit_light`.
+        light: light on it, for normals in its frame.
         palette: colours [10, 3] of parts, see :func:`.vehicle_parts.fit_palette`.
     """
     shown = constant_colours(item.cloud)
     points = item.cloud.means.cpu().numpy()
     colours = body_colours(body, points, shown.cpu().numpy(), light=light, palette=palette)
     drawn = body.drawn > 0
-    colours, scales = colours[drawn], body.drawn[drawn, None] * np.array(DISC, dtype=np.float32)
+    spacing = body.drawn[drawn, None]
+    scales = spacing * np.where(spacing > SPACING, DISC, BENT).astype(np.float32)
+    colours = colours[drawn]
     factors = np.array([(1 - 0.4 * (1 - f), f, f) for f in insets])
     normals = body.unit_normals()[drawn]
     helper = np.where(np.abs(normals[:, 2:]) < 0.9, [[0.0, 0, 1]], [[1.0, 0, 0]])
@@ -195,7 +198,9 @@ def _press(
     squares, turns = torch.linalg.eigh(axes @ axes.transpose(1, 2))
     turns = turns * torch.linalg.det(turns).sign()[:, None, None]
     quats = torch.from_numpy(matrix_to_quaternion(turns.numpy()))
-    scales = squares.clamp(min=MIN_SPREAD**2).sqrt()
+    # Rays that graze the surface would stretch a Gaussian into a long streak on it.
+    largest = gaussians.log_scales[rows].amax(dim=1).exp().cpu()
+    scales = squares.clamp(min=MIN_SPREAD**2).sqrt().float().minimum(largest[:, None])
     changed = {
         "means": means + rays * (distance * (1 - KEPT_DEPTH))[:, None],
         "quats": quats,

@@ -57,6 +57,7 @@ from .document import (
     SceneContent,
     SceneDocument,
     SkyPart,
+    SunlightPart,
     TrajectoryPart,
     pack_lanes,
     unpack_lanes,
@@ -112,6 +113,7 @@ def save_scene(scene: Scene, path: str | PathLike[str], *, overwrite: bool = Fal
         ground=_ground_part(scene.ground, ground),
         lidar=_lidar_part(scene.lidar),
         lanes=lanes,
+        sunlight=SunlightPart.of(scene.sunlight),
     )
     document = SceneDocument(
         kind="scene",
@@ -168,6 +170,7 @@ def load_scene(
             stored_ground=_ground(folder, document, verify),
             lidar=_lidar(folder, document, verify) if content.lidar else None,
             lanes=_lanes(folder, document, verify) if content.lanes else None,
+            sunlight=content.sunlight.build() if content.sunlight else None,
         )
     return scene.to(device)
 

@@ -27,6 +27,7 @@ from ..errors import BundleError, SceneError
 from ..lane import Area, Lane, Road, RoadLane, Signal, StopLine
 from ..lane_graph import LaneGraph
 from ..lens import lens_from, lens_values
+from ..sunlight import Sunlight
 from ..trajectory import Trajectory
 
 Count = Annotated[int, Field(ge=0)]
@@ -266,6 +267,27 @@ class LanesPart(_Part):
     document: dict[str, Any]
 
 
+class SunlightPart(_Part):
+    """The sun of a drive; see :class:`~real2sim_server.scene.Sunlight`."""
+
+    towards: Vector3
+    shade: Vector3
+
+    @classmethod
+    def of(cls, sunlight: Sunlight | None) -> SunlightPart | None:
+        """The part of a scene's sunlight; None for none."""
+        if sunlight is None:
+            return None
+        # Values come from a validated sun.
+        return cls.model_construct(
+            towards=tuple(sunlight.towards.tolist()), shade=tuple(sunlight.shade.tolist())
+        )
+
+    def build(self) -> Sunlight:
+        """The sunlight. Raises SceneError like its constructor."""
+        return Sunlight(np.array(self.towards), np.array(self.shade))
+
+
 class SceneContent(_Part):
     """The content of a scene, input of the content hash."""
 
@@ -278,6 +300,7 @@ class SceneContent(_Part):
     ground: GroundPart
     lidar: LidarPart | None = None
     lanes: LanesPart | None = None
+    sunlight: SunlightPart | None = None
 
     def build_rig(self) -> CameraRig:
         """The camera rig. Raises SceneError like its constructor."""

@@ -36,7 +36,7 @@ from ..figure import Figure
 from ..ground import Ground
 from ..scene import Scene, SceneObject, Sky
 from .bundle import load_scene, save_scene
-from .document import UNCERTAINTIES, CameraPart, GaitPart, TrajectoryPart
+from .document import UNCERTAINTIES, CameraPart, GaitPart, SunlightPart, TrajectoryPart
 
 FORMAT, VERSION = "real2sim-packed", 1
 DOCUMENT = "scene.json"
@@ -105,6 +105,7 @@ class _PackedDocument(_Part):
     background: _PackedCloud
     objects: list[_PackedObject]
     ground: _PackedGround
+    sunlight: SunlightPart | None = None
     provenance: dict[str, Any]
 
 
@@ -127,6 +128,7 @@ def write_packed(scene: Scene, path: str | PathLike[str]) -> None:
         background=_pack_cloud(scene.background, "background", arrays),
         objects=[_pack_object(o, f"{i}", arrays) for i, o in enumerate(scene.objects.values())],
         ground=_pack_ground(scene.ground, arrays),
+        sunlight=SunlightPart.of(scene.sunlight),
         provenance=json.loads(json.dumps(dict(scene.provenance), allow_nan=False)),
     )
     if scene.sky is not None:
@@ -309,6 +311,7 @@ def _scene(document: _PackedDocument, arrays: Arrays) -> Scene:
         ego_size=document.ego_size,
         provenance=document.provenance,
         stored_ground=_unpack_ground(document.ground, arrays),
+        sunlight=document.sunlight.build() if document.sunlight else None,
     )
 
 

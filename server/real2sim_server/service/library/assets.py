@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from real2sim_proto import ErrorCode
 from real2sim_proto.scenes import AssetInfo, AssetUpload
 
-from ...edit.appearance import Colour, ambient_colour, contact_shadow, relighting_gain, relit
+from ...edit.appearance import Colour, ambient_colour, relighting_gain, relit
+from ...edit.light import cast_shadow
 from ...geometry import Float, invert_transform
 from ...render import Backend, Instance, RasterOptions, rasterize
 from ...scene import Asset, BundleError, Figure, GaussianCloud, Ground, Scene, Trajectory
@@ -424,7 +425,7 @@ def draw_thumbnail(asset: Asset, *, width: int, backend: Backend) -> NDArray[np.
     distance = radius / np.sin(np.arctan(0.5 * height / (FOCAL * width)))
     eye = np.array(VIEW_FROM) / np.linalg.norm(VIEW_FROM) * distance
     floor = Ground.level(-asset.size[2] / 2)
-    shadow = contact_shadow(np.eye(4), asset.size, floor, device=asset.cloud.device)
+    shadow = cast_shadow(np.eye(4), asset.cloud, (1.0, 1.0, 1.0), asset.size, floor)
     output = rasterize(
         [Instance(_standing(asset)), *([shadow] if shadow else [])],
         invert_transform(_looking_at_origin(eye))[None],

@@ -161,7 +161,7 @@ def test_progress_reports_every_stage_to_its_end():
         on_progress=lambda *args: reported.append(args),
         timing_s=timing,
     )
-    stages = ["accumulate", "features", "stereo", "shape", "walls", "colour", "fill"]
+    stages = ["accumulate", "features", "stereo", "shape", "walls", "colour", "sunlight", "fill"]
     assert list(timing) == stages
     for stage in timing:
         last = [(done, total) for name, done, total in reported if name == stage][-1]

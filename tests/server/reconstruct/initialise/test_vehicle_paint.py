@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -133,7 +135,7 @@ def test_a_scene_without_part_colours_uses_the_defaults():
     np.testing.assert_allclose(palette_of({PARTS: kept.tolist()}), kept)
 
 
-def test_light_is_rotated_to_the_vehicle_frame_or_comes_from_above():
+def test_light_is_rotated_to_the_vehicle_frame_or_comes_from_above(tiny_scene):
     times = np.array([0, 1_000_000])
     pose = np.array([[0.0, -1, 0, 5], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
     path = Trajectory.from_transforms(times, np.stack([pose, pose]))
@@ -145,7 +147,11 @@ def test_light_is_rotated_to_the_vehicle_frame_or_comes_from_above():
         torch.zeros(1, 1, 3),
     )
     car = SceneObject("car", "car", SALOON, cloud, path)
+    normals = np.eye(3)
+    fitted = replace(tiny_scene, provenance={"reconstruction": {LIGHT_KEY: [0.0, 0.3, 0.2]}})
     np.testing.assert_allclose(
-        light_on(car, {LIGHT_KEY: [0.0, 0.3, 0.2]}), (0.3, 0, 0.2), atol=1e-9
+        light_on(car, fitted)(normals)[:, 0], np.exp([0.3, 0, 0.2]), rtol=1e-5
     )
-    np.testing.assert_allclose(light_on(car, None), FROM_ABOVE, atol=1e-9)
+    np.testing.assert_allclose(
+        light_on(car, tiny_scene)(normals)[:, 0], np.exp(FROM_ABOVE), rtol=1e-5
+    )

@@ -1,0 +1,337 @@
+"""Shadows and shading of edited objects.
+
+Shadows of recorded objects are part of the recorded colours. Each edited object gets its own layer
+of dark Gaussians on the ground: its silhouette along the sun, where the sun shines, and a soft
+contact shadow around its footprint.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Generic, TypeVar
+from weakref import WeakKeyDictionary
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ..geometry import (
+    Float,
+    apply_transform,
+    bottom_centres,
+    quaternion_to_matrix,
+    transform_from,
+    yaw_quaternion,
+)
+from ..render.types import Instance
+from ..scene import GaussianCloud, Ground, Sunlight, TimeColour
+from ..scene.cloud import SH_C0
+from ..scene.sunlight import Sunshine
+
+Size = tuple[float, float, float]
+
+CELL = 0.12
+"""Spacing of a shadow's Gaussians [m]; wider for large shadows."""
+
+MAX_CELLS = 2500
+SPREAD = 0.7
+"""Standard deviation of a shadow's Gaussians, relative to their spacing."""
+
+SHADOW_MARGIN = 0.35
+"""The contact shadow reaches this far beyond the footprint [m], fading."""
+
+PENUMBRA = 0.08
+"""Standard deviation of a silhouette's soft edge [m]."""
+
+LIFT = 0.03
+"""Height above the ground [m], in front of the ground's own Gaussians."""
+
+DARKNESS = 0.5
+"""Opacity of the contact shadow in the middle of the footprint."""
+
+FADE_HEIGHT = 1.0
+"""Objects this high above the ground cast no contact shadow [m]."""
+
+MIN_OPACITY = 0.02
+"""Cells with less shadow have no Gaussian."""
+
+MAX_POINTS = 20_000
+"""Maximum number of an object's Gaussians that form its silhouette."""
+
+GAPS = 0.35
+"""Gaps of a silhouette up to this wide are closed [m]."""
+
+TURN = np.deg2rad(3.0)
+"""Silhouettes are cached for directions of the sun in these steps [rad]."""
+
+TINT = 0.45
+"""Usual colour of sunlit ground; makes shadows as blue as in the log."""
+
+
+KEPT_SILHOUETTES, KEPT_SHADINGS = 32, 4
+"""Numbers of cached silhouettes and shadings per cloud."""
+
+K = TypeVar("K")
+V = TypeVar("V")
+
+
+class Recent(Generic[K, V]):
+    """The most recent results for each owner. Owners are held weakly; threads may share it.
+
+    Args:
+        limit: number of results per owner.
+    """
+
+    def __init__(self, limit: int) -> None:
+        self._limit, self._lock = limit, threading.RLock()
+        self._held: WeakKeyDictionary[K, OrderedDict[Hashable, V]] = WeakKeyDictionary()
+
+    def get(self, owner: K, key: Hashable, make: Callable[[], V]) -> V:
+        """The result for ``key``; ``make`` makes it if it is not held."""
+        with self._lock:
+            held = self._held.setdefault(owner, OrderedDict())
+            if key not in held:
+                held[key] = make()
+            held.move_to_end(key)
+            while len(held) > self._limit:
+                held.popitem(last=False)
+            return held[key]
+
+
+@dataclass(frozen=True, eq=False)
+class _Silhouette:
+    """Shadow of an object on level ground, in the level frame of its bottom's centre.
+
+    Attributes:
+        low: [2], corner of cell (0, 0) [m].
+        cell: edge of a cell [m].
+        covered: [X, Y] share of the sun that the object hides.
+        contact: [X, Y] contact shadow, from 0 to 1.
+    """
+
+    low: Float
+    cell: float
+    covered: NDArray[np.float32]
+    contact: NDArray[np.float32]
+
+    def places(self) -> Float:
+        """Centres [X, Y, 2] of the cells."""
+        x, y = (np.arange(n) + 0.5 for n in self.covered.shape)
+        return self.low + self.cell * np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
+
+
+def cast_shadow(
+    T_world_object: Float,
+    cloud: GaussianCloud,
+    scale: Size,
+    size: Size,
+    ground: Ground,
+    *,
+    sunshine: Sunshine | None = None,
+) -> Instance | None:
+    """The shadow of an object on the ground; None if there is none.
+
+    Args:
+        T_world_object: [4, 4] float64 pose of the box centre.
+        cloud: Gaussians of the object, in its frame before scaling.
+        scale: scale of the cloud.
+        size: (length, width, height) of the scaled box [m].
+        ground: ground below the box.
+        sunshine: sun of the scene; None casts only a contact shadow.
+    """
+    bottom = bottom_centres(T_world_object[None], size)[0]
+    clearance = max(0.0, float(bottom[2]) - ground.height(float(bottom[0]), float(bottom[1])))
+    contact = DARKNESS * max(0.0, 1 - clearance / FADE_HEIGHT)
+    forward = T_world_object[:3, 0]
+    heading = float(np.arctan2(forward[1], forward[0]))
+    level = transform_from([*bottom[:2], 0.0], yaw_quaternion(heading))
+    sun = None if sunshine is None else sunshine.sun
+    found = _silhouette(cloud, scale, size, sun, heading)
+    if sun is not None:
+        # The shadow of an object in the air is away from it.
+        level[:2, 3] -= clearance * sun.towards[:2] / sun.towards[2]
+    places = found.places().reshape(-1, 2)
+    world = apply_transform(level, np.column_stack([places, np.zeros(len(places))]))
+    dark = np.asarray(contact * found.contact.ravel(), np.float64)
+    if sunshine is not None:
+        shade = float(sunshine.sun.shade.min())
+        hidden = (1 - shade) * found.covered.ravel() * sunshine.lit(world[:, :2])
+        dark = 1 - (1 - dark) * (1 - hidden)
+    kept = dark > MIN_OPACITY
+    if not kept.any():
+        return None
+    places, dark = places[kept], dark[kept]
+    heights = ground.height_at(world[kept, :2]) + LIFT
+    spread = SPREAD * found.cell
+    tint = np.full(3, 0.02)
+    if sun is not None:
+        tint += TINT * (sun.shade - sun.shade.min()) / (1 - sun.shade.min())
+    count = len(places)
+    layer = GaussianCloud(
+        means=torch.from_numpy(np.column_stack([places, heights])).float(),
+        quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
+        scales=torch.tensor([spread, spread, 0.004]).repeat(count, 1),
+        opacities=torch.from_numpy(_opacities(dark)).float(),
+        sh=torch.from_numpy((tint - 0.5) / SH_C0).float().expand(count, 1, 3).contiguous(),
+    )
+    return Instance(layer.to(cloud.device), level, instance_id=0)
+
+
+def _opacities(dark: Float) -> Float:
+    """Opacities [N] of Gaussians on a grid that together hide the shares ``dark`` [N]."""
+    peaks, total = _overlap()
+    return np.asarray(np.interp(dark, total, peaks))
+
+
+@cache
+def _overlap() -> tuple[Float, Float]:
+    """Opacities [P] of equal Gaussians on a grid, and the share [P] that they hide together."""
+    peaks = np.linspace(0, 0.98, 99)
+    offsets = np.arange(-4, 5)
+    inside = (np.arange(4) + 0.5) / 4 - 0.5
+    along = (offsets[:, None] + inside) ** 2
+    squares = along[:, None, :, None] + along[None, :, None, :]
+    weights = np.exp(-0.5 * squares / SPREAD**2).reshape(len(offsets) ** 2, -1)
+    clear = np.log1p(-peaks[:, None, None] * weights).sum(axis=1)
+    return peaks, 1 - np.exp(clear).mean(axis=1)
+
+
+_silhouettes: Recent[GaussianCloud, _Silhouette] = Recent(KEPT_SILHOUETTES)
+
+
+def _silhouette(
+    cloud: GaussianCloud, scale: Size, size: Size, sun: Sunlight | None, heading: float
+) -> _Silhouette:
+    turn, way = None, np.zeros(2)
+    if sun is not None:
+        turn = round((np.arctan2(sun.towards[1], sun.towards[0]) - heading) / TURN)
+        length = float(np.hypot(*sun.towards[:2]) / sun.towards[2])
+        way = -length * np.array([np.cos(turn * TURN), np.sin(turn * TURN)])
+
+    def make() -> _Silhouette:
+        points = None if sun is None else _points(cloud, scale, size)
+        return _made(points, size, way)
+
+    return _silhouettes.get(cloud, (scale, size, *way), make)
+
+
+def _points(cloud: GaussianCloud, scale: Size, size: Size) -> Float:
+    """Centres [N, 3] of the visible Gaussians in the box, z above its bottom."""
+    points = cloud.means[cloud.opacities > 0.3].cpu().double().numpy() * np.array(scale)
+    half = np.array(size) / 2
+    points = points[(np.abs(points) < 1.1 * half).all(axis=1)] + [0, 0, half[2]]
+    points[:, 2] = points[:, 2].clip(0)
+    return np.asarray(points[:: -(-len(points) // MAX_POINTS) or 1])
+
+
+def _made(points: Float | None, size: Size, way: Float) -> _Silhouette:
+    """Silhouette of ``points``; a point at height h shades the ground ``way`` [2] * h away."""
+    import cv2
+
+    half = np.array(size[:2]) / 2
+    spots = np.zeros((0, 2)) if points is None else points[:, :2] + points[:, 2:] * way
+    ends = np.concatenate([spots, [-half - SHADOW_MARGIN, half + SHADOW_MARGIN]])
+    low, high = ends.min(axis=0) - 3 * PENUMBRA, ends.max(axis=0) + 3 * PENUMBRA
+    cell = max(CELL, float(np.sqrt(np.prod(high - low) / MAX_CELLS)))
+    shape = np.ceil((high - low) / cell).astype(int)
+    covered = np.zeros(shape, np.float32)
+    if len(spots):
+        covered[tuple(((spots - low) / cell).astype(int).T)] = 1
+        width = 2 * round(GAPS / 2 / cell) + 1
+        closing = np.ones((width, width), np.uint8)
+        closed = cv2.morphologyEx(np.pad(covered, width), cv2.MORPH_CLOSE, closing)
+        soft = cv2.GaussianBlur(closed, (0, 0), PENUMBRA / cell)
+        covered = np.asarray(soft[width:-width, width:-width], np.float32)
+    made = _Silhouette(low, cell, covered, np.zeros(0, np.float32))
+    x, y = (np.abs(made.places()) / (2 * half + 2 * SHADOW_MARGIN)).transpose(2, 0, 1)
+    inside = np.clip((0.5 - np.maximum(x, y)) / 0.2, 0.0, 1.0)
+    corner = np.clip((0.62 - np.hypot(x, y)) / 0.2, 0.0, 1.0)
+    contact = (inside * inside * (3 - 2 * inside) * corner).astype(np.float32)
+    return _Silhouette(low, cell, covered, contact)
+
+
+# --- Shading -------------------------------------------------------------------------------------
+
+NEIGHBOURS = 24
+"""Number of neighbours that give the normal of a Gaussian."""
+
+STEPS = 4
+"""Steps of the share of the sun, as for directions above."""
+
+GAIN_RANGE = (0.4, 2.5)
+"""Limits of the change of brightness."""
+
+
+_shadings: Recent[GaussianCloud, tuple[GaussianCloud, TimeColour | None]] = Recent(KEPT_SHADINGS)
+_normals: Recent[GaussianCloud, Float] = Recent(1)
+
+
+def shaded(
+    cloud: GaussianCloud,
+    colour: TimeColour | None,
+    was: tuple[float, float],
+    now: tuple[float, float],
+    sunshine: Sunshine,
+) -> tuple[GaussianCloud, TimeColour | None]:
+    """The cloud of an object under changed light, and its change over time.
+
+    Args:
+        cloud: in the frame of the object.
+        colour: its change over time.
+        was, now: heading [rad] and share of the sun when recorded, and after the edit.
+        sunshine: sun of the scene.
+    """
+    steps = tuple((round(heading / TURN), round(STEPS * lit)) for heading, lit in (was, now))
+    if steps[0] == steps[1]:
+        return cloud, colour
+
+    def make() -> tuple[GaussianCloud, TimeColour | None]:
+        normals = _normals.get(cloud, None, lambda: _outward(cloud))
+        before, after = (
+            sunshine.brightness(
+                normals @ quaternion_to_matrix(yaw_quaternion(turn * TURN)).T, lit / STEPS
+            )
+            for turn, lit in steps
+        )
+        gain = torch.from_numpy(np.clip(after / before, *GAIN_RANGE)).to(cloud.sh)
+        return _brightened(cloud, colour, gain)
+
+    return _shadings.get(cloud, steps, make)
+
+
+def _outward(cloud: GaussianCloud) -> Float:
+    """Unit normals [N, 3] of an object's surface at its Gaussians, outwards."""
+    from scipy.spatial import cKDTree
+
+    means = cloud.means.cpu().double().numpy()
+    solid = means[(cloud.opacities > 0.3).cpu().numpy()]
+    if len(solid) <= NEIGHBOURS:
+        return np.tile([0.0, 0, 1], (len(means), 1))
+    _, near = cKDTree(solid).query(means, k=NEIGHBOURS, workers=-1)
+    offsets = solid[near] - solid[near].mean(axis=1, keepdims=True)
+    _, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", offsets, offsets))
+    normals = axes[:, :, 0]
+    # Outwards is away from the middle of the body.
+    half = np.abs(solid).max(axis=0)
+    middle = means.copy()
+    middle[:, 0] = means[:, 0].clip(-0.7 * half[0], 0.7 * half[0])
+    middle[:, 1], middle[:, 2] = 0, means[:, 2].clip(-0.7 * half[2], 0.2 * half[2])
+    inwards = (normals * (means - middle)).sum(axis=1) < 0
+    normals[inwards] *= -1
+    return np.asarray(normals)
+
+
+def _brightened(
+    cloud: GaussianCloud, colour: TimeColour | None, gain: Tensor
+) -> tuple[GaussianCloud, TimeColour | None]:
+    sh = cloud.sh * gain[:, None]
+    # The renderer adds 0.5 to the harmonics; this constant must be multiplied too.
+    sh[:, 0] += (gain - 1) * 0.5 / SH_C0
+    if colour is not None:
+        colour = replace(colour, coefficients=colour.coefficients * gain[:, None])
+    return replace(cloud, sh=sh), colour

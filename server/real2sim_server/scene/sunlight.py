@@ -1,0 +1,233 @@
+"""The sun of a scene: where it shines on the ground, and how bright it makes surfaces."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..geometry import Float, invert_transform
+from .cloud import SH_C0, UNSEEN
+from .coverage import LOW
+from .errors import SceneError
+from .ground_fit import pull_push
+from .trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from .scene import Scene
+
+Size = tuple[float, float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Sunlight:
+    """The sun of a drive, from the shadows of its vehicles.
+
+    Attributes:
+        towards: [3] float64, unit vector towards the sun, in the world; above the horizon.
+        shade: [3] float64 in (0, 1), RGB of ground in a vehicle's shadow relative to sunlit ground.
+
+    Raises:
+        SceneError: not such values.
+    """
+
+    towards: Float
+    shade: Float
+
+    def __post_init__(self) -> None:
+        towards, shade = (np.array(v, dtype=np.float64) for v in (self.towards, self.shade))
+        if towards.shape != (3,) or not abs(np.linalg.norm(towards) - 1) < 1e-3 or towards[2] <= 0:
+            raise SceneError(f"towards the sun must be a unit vector with z > 0, not {towards}")
+        if shade.shape != (3,) or not ((shade > 0) & (shade < 1)).all():
+            raise SceneError(f"shade must be three values between 0 and 1, not {shade}")
+        for name, value in (("towards", towards), ("shade", shade)):
+            value.flags.writeable = False
+            object.__setattr__(self, name, value)
+
+    def hidden_by(
+        self, T_world_box: Float, size: Size, points: Float, *, margin: float = 0.0
+    ) -> NDArray[np.bool_]:
+        """[N] bool, ``points`` [N, 3] in the shadow of a box enlarged by ``margin`` [m]."""
+        halves = (np.array(size) / 2 + margin)[None]
+        return boxes_hit(points, self.towards, invert_transform(T_world_box)[None], halves)
+
+
+def boxes_hit(points: Float, rays: Float, boxes: Float, halves: Float) -> NDArray[np.bool_]:
+    """[N] bool, whether rays from points hit a box.
+
+    Args:
+        points: [N, 3], world [m].
+        rays: directions [3] or [N, 3].
+        boxes: ``T_box_world`` [B, 4, 4].
+        halves: [B, 3] half of the sizes [m].
+    """
+    found = np.zeros(len(points), np.bool_)
+    for T_box_world, half in zip(boxes, halves, strict=True):
+        axes = T_box_world[:3, :3].T
+        starts, ways = points @ axes + T_box_world[:3, 3], rays @ axes
+        enter, leave = np.full(len(points), -np.inf), np.full(len(points), np.inf)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            for axis in range(3):
+                a = (-half[axis] - starts[:, axis]) / ways[..., axis]
+                b = (half[axis] - starts[:, axis]) / ways[..., axis]
+                enter = np.fmax(enter, np.fmin(a, b))
+                leave = np.fmin(leave, np.fmax(a, b))
+        found |= (leave > 0) & (enter < leave)
+    return found
+
+
+CELL = 0.4
+"""Edge of the cells in which ground counts as sunlit or not [m]."""
+
+SHADOW_REACH = 0.3
+"""Ground this close to the shadow of a parked object does not decide [m]."""
+
+MIN_CONTRAST = 0.5
+"""Minimum contrast of dark and bright ground for shade, relative to the contrast of shadows."""
+
+MIN_CELLS = 100
+"""Minimum number of cells with ground for shade."""
+
+LUMA = np.array([0.2126, 0.7152, 0.0722])
+
+DISPLAY = 2.2
+"""Exponent from display values to light."""
+
+SIDE_LIGHT = 0.7
+"""Light of the sky on upright surfaces, relative to level ground."""
+
+
+class Sunshine:
+    """Where the sun shines on the ground, from the brightness of the ground.
+
+    Attributes:
+        sun: the sun.
+
+    Args:
+        sun: the sun.
+        places: [N, 2] of ground outside of the shadows of vehicles, world [m].
+        colours: [N, 3] there.
+    """
+
+    def __init__(self, sun: Sunlight, places: Float, colours: NDArray[np.float32]) -> None:
+        self.sun = sun
+        self._low = places.min(axis=0) if len(places) else np.zeros(2)
+        at = ((places - self._low) / CELL).astype(np.int64)
+        shape = tuple(at.max(axis=0) + 1) if len(places) else (1, 1)
+        cells = np.ravel_multi_index(at.T, shape)
+        counts = np.bincount(cells, minlength=shape[0] * shape[1])
+        sums = [np.bincount(cells, colours[:, c], len(counts)) for c in range(3)]
+        mean = (np.stack(sums, -1) / counts.clip(1)[:, None]).reshape(*shape, 3)
+        weights = np.minimum(counts / 3, 1).reshape(shape)
+        self._usual = pull_push(mean.astype(np.float32), weights.astype(np.float32))
+        self._lit = _lit(self._usual, counts.reshape(shape) > 0, sun)
+
+    def lit(self, places: Float) -> Float:
+        """Share [N] of the sun that reaches the ground at ``places`` [N, 2] [m]."""
+        return self._at(self._lit, places)
+
+    def lit_along(self, trajectory: Trajectory) -> float:
+        """The mean share over the recorded positions of an object."""
+        return float(self.lit(trajectory.positions[:, :2]).mean())
+
+    def without_shadow(self, colours: Float, places: Float) -> Float:
+        """Colours [N, 3] of ground at ``places`` [N, 2] in the shadow of an object, without it.
+
+        Ground that is as bright as usual there does not change.
+        """
+        usual = np.stack([self._at(self._usual[..., c], places) for c in range(3)], axis=1)
+        ratio = np.log((colours @ LUMA).clip(0.01) / (usual @ LUMA).clip(0.01))
+        dark = ratio / np.log(float(self.sun.shade @ LUMA))
+        share = np.clip((dark - 0.25) / 0.5, 0, 1) * self.lit(places)
+        return np.asarray(colours * (1 + share[:, None] * (1 / self.sun.shade - 1)))
+
+    def brightness(self, normals: Float, lit: float) -> NDArray[np.float32]:
+        """Brightness [N, 3] of surfaces, 1 on sunlit level ground, as display values.
+
+        Args:
+            normals: [N, 3] unit, outwards, in the world.
+            lit: share of the sun that reaches them.
+        """
+        shade = self.sun.shade**DISPLAY
+        facing = (normals @ self.sun.towards).clip(0) / self.sun.towards[2]
+        sky = SIDE_LIGHT + (1 - SIDE_LIGHT) * normals[:, 2]
+        light = sky[:, None] * shade + lit * facing[:, None] * (1 - shade)
+        return np.asarray(light ** (1 / DISPLAY), np.float32)
+
+    def _at(self, values: NDArray[np.float32], places: Float) -> Float:
+        from scipy.ndimage import map_coordinates
+
+        at = (places - self._low) / CELL - 0.5
+        return np.asarray(map_coordinates(values, at.T, order=1, mode="nearest"), np.float64)
+
+
+def _lit(
+    usual: NDArray[np.float32], known: NDArray[np.bool_], sun: Sunlight
+) -> NDArray[np.float32]:
+    """[X, Y] share of the sun: 1 on bright ground and 0 on dark ground (Otsu 1979)."""
+    import cv2
+
+    bright = np.log((usual @ LUMA.astype(np.float32)).clip(0.01))
+    smooth = np.asarray(cv2.GaussianBlur(bright, (0, 0), 1.0)).reshape(bright.shape)
+    values = np.sort(smooth[known].astype(np.float64))
+    contrast = -float(np.log(sun.shade @ LUMA))
+    if len(values) < MIN_CELLS:
+        return np.ones_like(bright)
+    count = np.arange(1, len(values))
+    sums = np.cumsum(values)[:-1]
+    dark, rest = sums / count, (values.sum() - sums) / (len(values) - count)
+    best = int((count * (len(values) - count) * (rest - dark) ** 2).argmax())
+    if rest[best] - dark[best] < MIN_CONTRAST * contrast:
+        return np.ones_like(bright)
+    edge = (rest[best] + dark[best]) / 2
+    return np.asarray(np.clip((smooth - edge) / (0.4 * contrast) + 0.5, 0, 1), np.float32)
+
+
+_made: WeakKeyDictionary[Scene, Sunshine] = WeakKeyDictionary()
+_making = threading.Lock()
+
+
+def sunshine_of(scene: Scene) -> Sunshine | None:
+    """Where the sun shines in a scene; None without sunlight. Computed once."""
+    sun = scene.sunlight
+    if sun is None:
+        return None
+    with _making:
+        if scene not in _made:
+            _made[scene] = _from_background(scene, sun)
+        return _made[scene]
+
+
+def _from_background(scene: Scene, sun: Sunlight) -> Sunshine:
+    cloud = scene.background
+    means = cloud.means.cpu().double().numpy()
+    shown = (cloud.opacities > 0.3).cpu().numpy() & scene.ground.covers(means[:, :2])
+    shown &= np.abs(means[:, 2] - scene.ground.height_at(means[:, :2])) < LOW
+    if cloud.uncertainties is not None:
+        shown &= cloud.uncertainties.cpu().numpy() < 0.8 * UNSEEN
+    colours = (cloud.sh[:, 0].cpu().numpy()[shown] * SH_C0 + 0.5).clip(0, 1)
+    points = means[shown]
+    clear = ~parked_shadows(scene.objects.values(), points, sun)
+    return Sunshine(sun, points[clear, :2], colours[clear])
+
+
+class _Boxed(Protocol):
+    @property
+    def size(self) -> Size: ...
+    @property
+    def trajectory(self) -> Trajectory: ...
+
+
+def parked_shadows(objects: Iterable[_Boxed], points: Float, sun: Sunlight) -> NDArray[np.bool_]:
+    """[N] bool, ``points`` [N, 3] in or near the shadows of parked objects."""
+    found = np.zeros(len(points), np.bool_)
+    for item in objects:
+        if not item.trajectory.moves:
+            T = item.trajectory.middle
+            found |= sun.hidden_by(T, item.size, points, margin=SHADOW_REACH)
+    return found
