@@ -20,7 +20,7 @@ from ..scene import UNSEEN, GaussianCloud, Scene
 from ..scene.cloud import SH_C0
 from ..scene.coverage import LOW, MARGIN
 from ..scene.ground_fit import pull_push
-from ..scene.sunlight import Sunshine, parked_shadows
+from ..scene.sunlight import Sunshine, lasting_shadows
 from .state import ObjectState, ScenarioState
 
 Colour = tuple[float, float, float]
@@ -42,8 +42,9 @@ CELL = 0.08
 MIN_POINTS, MIN_CELLS = 6, 3
 """Minimum number of known Gaussians, and of known cells in a strip."""
 
-SHADOW_LENGTH = 8.0
-"""Maximum length of shadows that are taken out of the ground [m]."""
+BRIEF = 0.1
+"""Share of an object's time in which its shadow must be at a place to be looked for in the ground.
+"""
 
 
 def vacated_parking(state: ScenarioState, poses: Mapping[str, Float]) -> tuple[str, ...]:
@@ -66,14 +67,39 @@ def vacated_parking(state: ScenarioState, poses: Mapping[str, Float]) -> tuple[s
     )
 
 
-def inpaint_ground(
-    scene: Scene,
-    background: GaussianCloud,
-    left: Iterable[str],
-    *,
-    sunshine: Sunshine | None = None,
+def vacated_lanes(state: ScenarioState) -> tuple[str, ...]:
+    """Ids of recorded moving objects that are deleted or move elsewhere."""
+    return tuple(
+        recorded.object_id
+        for recorded in state.recorded.values()
+        if not _parked(recorded)
+        and (now := state.objects[recorded.object_id]) is not recorded
+        and (now.deleted or now.trajectory is not recorded.trajectory)
+    )
+
+
+def without_shadows(
+    scene: Scene, background: GaussianCloud, left: Iterable[str], sunshine: Sunshine
 ) -> GaussianCloud:
-    """The background with the ground continued where objects ``left`` stood, without their shadows.
+    """The background without the recorded shadows of objects ``left`` on the ground.
+
+    Raises:
+        UnknownObjectError: ``scene`` has no such object.
+    """
+    sh, sun = background.sh.clone(), sunshine.sun
+    points = background.means.cpu().double().numpy()
+    height = np.abs(points[:, 2] - scene.ground.height_at(points[:, :2]))
+    level = np.flatnonzero(height <= LOW)
+    for object_id in left:
+        item = scene.object(object_id)
+        dark = level[lasting_shadows([item], points[level], sun, share=BRIEF)]
+        rows = torch.from_numpy(dark).to(sh.device)
+        _relight(sh, rows, points[dark, :2], sunshine)
+    return replace(background, sh=sh)
+
+
+def inpaint_ground(scene: Scene, background: GaussianCloud, left: Iterable[str]) -> GaussianCloud:
+    """The background with the ground continued where objects ``left`` stood.
 
     Gaussians inside a box and above its ground become invisible, because they belong to the object.
     Guessed colours get the uncertainty of unseen Gaussians.
@@ -82,7 +108,6 @@ def inpaint_ground(
         scene: has the objects.
         background: its background.
         left: ids of the objects.
-        sunshine: sun of the scene; None if it casts no shadows.
 
     Raises:
         UnknownObjectError: ``scene`` has no such object.
@@ -90,7 +115,6 @@ def inpaint_ground(
     opacities, sh = background.opacities.clone(), background.sh.clone()
     known = background.uncertainties
     uncertainties = None if known is None else known.clone()
-    points = background.means.cpu().double().numpy()
     for object_id in left:
         parked = scene.object(object_id)
         T_world_box = parked.trajectory.middle
@@ -101,11 +125,6 @@ def inpaint_ground(
         height = local[:, 2] + half[2]
         level = height.abs() <= LOW
         opacities[(beyond <= 0) & (height > LOW) & (local[:, 2] <= half[2])] = 0.0
-        if sunshine is not None:
-            near = (level & (beyond <= SHADOW_LENGTH)).nonzero()[:, 0]
-            shadow = parked_shadows([parked], points[near.cpu()], sunshine.sun)
-            near = near[torch.from_numpy(shadow)]
-            _relight(sh, near, points[near.cpu(), :2], sunshine)
         around = level & (beyond > MARGIN) & (beyond <= RIM) & (opacities > 0.1)
         beneath = level & (beyond <= MARGIN)
         _continue_ground(sh, local[:, :2], beneath, around, half[:2] + MARGIN)
@@ -189,6 +208,7 @@ def _join(mean: Float, known: NDArray[np.bool_], axis: int, half: float) -> tupl
         filled = pull_push(strip[None], enough[None].astype(np.float32))[0]
         ends.append((filled, enough))
     (first, a), (last, b) = ends
+    first, last = (first if a.any() else last), (last if b.any() else first)
     share = np.clip((along + half) / (2 * half), 0, 1)[:, None, None]
     joined = np.moveaxis(first * (1 - share) + last * share, 0, axis)
     both = a & b

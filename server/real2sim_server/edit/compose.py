@@ -23,7 +23,13 @@ from ..render.types import Instance
 from ..scene import Figure, GaussianCloud, Lidar, Scene, Stride, Trajectory
 from ..scene.cloud import SH_C0
 from ..scene.sunlight import sunshine_of
-from .appearance import inpaint_ground, lamp_cloud, vacated_parking
+from .appearance import (
+    inpaint_ground,
+    lamp_cloud,
+    vacated_lanes,
+    vacated_parking,
+    without_shadows,
+)
 from .light import Recent, cast_shadow, shaded
 from .motion import require_object
 from .state import ObjectState, ScenarioState
@@ -231,23 +237,26 @@ def figure_of(scene: Scene, subject: ObjectState) -> Figure | None:
 def composed_background(
     scene: Scene, state: ScenarioState, poses: Mapping[str, Float]
 ) -> GaussianCloud:
-    """The background without erased regions, with inpainted ground where parked objects were.
+    """The background without erased regions, with inpainted ground where parked objects were, and
+    without the recorded shadows of objects that are elsewhere.
 
     ``poses`` are ``T_world_object`` [4, 4] by id; parked objects that they move uncover the ground.
     All other tensors are shared.
     """
     erased, left = state.erased, vacated_parking(state, poses)
-    if not erased and not left:
+    moved = vacated_lanes(state) if scene.sunlight is not None else ()
+    if not erased and not left and not moved:
         return scene.background
 
     def make() -> GaussianCloud:
-        background = scene.background
+        background, sunshine = scene.background, sunshine_of(scene)
+        if sunshine is not None and (left or moved):
+            background = without_shadows(scene, background, left + moved, sunshine)
         if left:
-            sunshine = sunshine_of(scene)
-            background = inpaint_ground(scene, background, left, sunshine=sunshine)
+            background = inpaint_ground(scene, background, left)
         return without_regions(background, erased) if erased else background
 
-    return _backgrounds.get(scene, (erased, left), make)
+    return _backgrounds.get(scene, (erased, left, moved), make)
 
 
 def without_regions(background: GaussianCloud, erased: tuple[EraseRegion, ...]) -> GaussianCloud:

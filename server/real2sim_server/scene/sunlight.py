@@ -85,7 +85,17 @@ CELL = 0.4
 """Edge of the cells in which ground counts as sunlit or not [m]."""
 
 SHADOW_REACH = 0.3
-"""Ground this close to the shadow of a parked object does not decide [m]."""
+"""Ground this close to the lasting shadow of an object does not decide [m]."""
+
+LASTING = 0.3
+"""Share of an object's time in which its shadow must be at a place to become part of the recorded
+ground: that of a parked car, or of one in a traffic jam."""
+
+POSES = 16
+"""Number of compared poses of a moving object."""
+
+MAX_SHADOW = 10.0
+"""Maximum length of a shadow [m]."""
 
 MIN_CONTRAST = 0.5
 """Minimum contrast of dark and bright ground for shade, relative to the contrast of shadows."""
@@ -138,26 +148,27 @@ class Sunshine:
     def without_shadow(self, colours: Float, places: Float) -> Float:
         """Colours [N, 3] of ground at ``places`` [N, 2] in the shadow of an object, without it.
 
-        Ground that is as bright as usual there does not change.
+        Ground that is as bright as usual there does not change. The rest gets the usual hue.
         """
         usual = np.stack([self._at(self._usual[..., c], places) for c in range(3)], axis=1)
         ratio = np.log((colours @ LUMA).clip(0.01) / (usual @ LUMA).clip(0.01))
         dark = ratio / np.log(float(self.sun.shade @ LUMA))
-        share = np.clip((dark - 0.25) / 0.5, 0, 1) * self.lit(places)
-        return np.asarray(colours * (1 + share[:, None] * (1 / self.sun.shade - 1)))
+        share = (np.clip((dark - 0.25) / 0.5, 0, 1) * self.lit(places))[:, None]
+        lit = usual * ((colours / self.sun.shade) @ LUMA / (usual @ LUMA).clip(0.01))[:, None]
+        return np.asarray(colours * (1 - share) + lit * share)
 
     def brightness(self, normals: Float, lit: float) -> NDArray[np.float32]:
-        """Brightness [N, 3] of surfaces, 1 on sunlit level ground, as display values.
+        """Brightness [N, 1] of surfaces, 1 on sunlit level ground, as display values.
 
         Args:
             normals: [N, 3] unit, outwards, in the world.
             lit: share of the sun that reaches them.
         """
-        shade = self.sun.shade**DISPLAY
+        shade = float(self.sun.shade @ LUMA) ** DISPLAY
         facing = (normals @ self.sun.towards).clip(0) / self.sun.towards[2]
         sky = SIDE_LIGHT + (1 - SIDE_LIGHT) * normals[:, 2]
-        light = sky[:, None] * shade + lit * facing[:, None] * (1 - shade)
-        return np.asarray(light ** (1 / DISPLAY), np.float32)
+        light = sky * shade + lit * facing * (1 - shade)
+        return np.asarray(light ** (1 / DISPLAY), np.float32)[:, None]
 
     def _at(self, values: NDArray[np.float32], places: Float) -> Float:
         from scipy.ndimage import map_coordinates
@@ -212,7 +223,7 @@ def _from_background(scene: Scene, sun: Sunlight) -> Sunshine:
         shown &= cloud.uncertainties.cpu().numpy() < 0.8 * UNSEEN
     colours = (cloud.sh[:, 0].cpu().numpy()[shown] * SH_C0 + 0.5).clip(0, 1)
     points = means[shown]
-    clear = ~parked_shadows(scene.objects.values(), points, sun)
+    clear = ~lasting_shadows(scene.objects.values(), points, sun)
     return Sunshine(sun, points[clear, :2], colours[clear])
 
 
@@ -223,11 +234,25 @@ class _Boxed(Protocol):
     def trajectory(self) -> Trajectory: ...
 
 
-def parked_shadows(objects: Iterable[_Boxed], points: Float, sun: Sunlight) -> NDArray[np.bool_]:
-    """[N] bool, ``points`` [N, 3] in or near the shadows of parked objects."""
+def lasting_shadows(
+    objects: Iterable[_Boxed], points: Float, sun: Sunlight, *, share: float = LASTING
+) -> NDArray[np.bool_]:
+    """[N] bool, ``points`` [N, 3] on the ground in or near the shadow of one of the objects for
+    more than ``share`` of its recorded time.
+    """
     found = np.zeros(len(points), np.bool_)
     for item in objects:
-        if not item.trajectory.moves:
-            T = item.trajectory.middle
-            found |= sun.hidden_by(T, item.size, points, margin=SHADOW_REACH)
+        track = item.trajectory
+        poses = [track.middle]
+        if track.moves:
+            times = np.linspace(track.start_us, track.end_us, POSES).astype(np.int64)
+            poses = [track.transform(int(t)) for t in times]
+        reach = float(np.hypot(*item.size[:2])) / 2 + MAX_SHADOW
+        centres = np.array([T[:2, 3] for T in poses])
+        low, high = centres.min(axis=0) - reach, centres.max(axis=0) + reach
+        near = np.flatnonzero(((points[:, :2] > low) & (points[:, :2] < high)).all(axis=1))
+        counts = np.zeros(len(near))
+        for T in poses:
+            counts += sun.hidden_by(T, item.size, points[near], margin=SHADOW_REACH)
+        found[near[counts > share * len(poses)]] = True
     return found

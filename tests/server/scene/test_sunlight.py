@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from real2sim_server.geometry import transform_from
-from real2sim_server.scene import Sunlight
+from real2sim_server.scene import Sunlight, Trajectory
 from real2sim_server.scene.errors import SceneError
 from real2sim_server.scene.io import load_scene, read_packed, save_scene, write_packed
-from real2sim_server.scene.sunlight import Sunshine
+from real2sim_server.scene.sunlight import LUMA, Sunshine, lasting_shadows
 
 SHADE = np.array([0.5, 0.55, 0.6])
 SUN = Sunlight(np.array([-0.6, 0.0, 0.8]), SHADE)
@@ -84,8 +84,8 @@ def test_level_ground_has_brightness_one_in_the_sun_and_that_of_shadows_in_the_s
     sunny = ground(lambda places: np.full(len(places), 0.5))
     up = np.array([[0.0, 0, 1]])
 
-    np.testing.assert_allclose(sunny.brightness(up, 1.0), [[1.0] * 3], atol=1e-6)
-    np.testing.assert_allclose(sunny.brightness(up, 0.0), [SHADE], atol=1e-6)
+    assert sunny.brightness(up, 1.0).item() == pytest.approx(1.0)
+    assert sunny.brightness(up, 0.0).item() == pytest.approx(SHADE @ LUMA)
 
 
 def test_the_side_towards_the_sun_is_brighter_only_in_the_sun():
@@ -97,3 +97,19 @@ def test_the_side_towards_the_sun_is_brighter_only_in_the_sun():
 
     assert (towards > 1.2 * away).all()
     np.testing.assert_allclose(shaded[0], shaded[1])
+
+
+class Boxed:
+    def __init__(self, speed):
+        times = np.arange(0, 5_000_001, 500_000)
+        positions = np.zeros((len(times), 3))
+        positions[:, 0], positions[:, 2] = speed * times * 1e-6, 1.0
+        self.size = (4.0, 2.0, 2.0)
+        self.trajectory = Trajectory(times, positions, np.tile([1.0, 0, 0, 0], (len(times), 1)))
+
+
+@pytest.mark.parametrize(("speed", "lasts"), [(0.0, True), (0.5, True), (10.0, False)])
+def test_only_slow_and_parked_objects_leave_a_lasting_shadow(speed, lasts):
+    place = np.array([[2.5, 0.0, 0.0]])
+
+    assert lasting_shadows([Boxed(speed)], place, SUN).tolist() == [lasts]

@@ -18,7 +18,7 @@ from ...maps import laid_on, lanes_of_log
 from ...scene import GaussianCloud, Ground, Scene, SceneObject, Sky
 from ...scene.cloud import SH_C0
 from ...scene.ground_fit import DrivenPath, GroundFit, box_bottoms, fit_ground
-from ...scene.sunlight import Sunlight, Sunshine, parked_shadows
+from ...scene.sunlight import Sunlight, Sunshine, lasting_shadows
 from ..logged_view import sky_mask
 from ..options import InitialiseOptions, OnProgress, ReconstructError, Stages
 from .accumulate import (
@@ -382,7 +382,7 @@ def _inpaint(
     sunshine = None
     if sunlight is not None:
         places, shown = points[ground].astype(np.float64), known[ground]
-        shown = shown & ~parked_shadows(log.tracks, places, sunlight)
+        shown = shown & ~lasting_shadows(log.tracks, places, sunlight)
         sunshine = Sunshine(sunlight, places[shown, :2], colours[ground][shown])
     return _inpaint_objects(log, parts, filled, known, sunshine)
 

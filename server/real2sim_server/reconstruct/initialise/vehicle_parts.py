@@ -93,6 +93,8 @@ def light_on(item: SceneObject, scene: Scene) -> Light:
 
 PALETTE_DOUBT = 2.0
 """Weight of the default colour of a part, in vehicles that show the part."""
+MAX_GLASS = 0.8
+"""Maximum brightness of a vehicle's glass, relative to its paint."""
 PARTS = "vehicle_parts"
 """Key of the colours of parts in a scene's reconstruction provenance."""
 FRAME = 0.035
@@ -183,11 +185,15 @@ def with_paints(
 ) -> Colours:
     """The palette [10, 3] of one vehicle.
 
-    A paint that the vehicle does not show defaults to the other one, otherwise to ``usual`` [3]."""
+    A paint that the vehicle does not show defaults to the other one, otherwise to ``usual`` [3].
+    Glass is darker than the paint.
+    """
     known = [paints[part] for part in PAINTED if part in paints]
     own = palette.copy()
     for part in PAINTED:
         own[part] = paints.get(part, known[0] if known else usual)
+    most = MAX_GLASS * own[Part.PAINT].mean()
+    own[Part.GLASS] *= min(1.0, most / max(float(own[Part.GLASS].mean()), 1e-3))
     return own
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from real2sim_server.reconstruct.initialise.surfels import GREY
 from real2sim_server.reconstruct.initialise.vehicle_body import (
     VehicleSurface,
     fill_vehicles,
@@ -22,6 +23,7 @@ from real2sim_server.reconstruct.initialise.vehicle_parts import (
     fit_light,
     light_on,
     palette_of,
+    with_paints,
 )
 from real2sim_server.reconstruct.initialise.vehicle_parts import LIGHT as LIGHT_KEY
 from real2sim_server.scene import GaussianCloud, SceneObject, Trajectory
@@ -155,3 +157,12 @@ def test_light_is_rotated_to_the_vehicle_frame_or_comes_from_above(tiny_scene):
     np.testing.assert_allclose(
         light_on(car, tiny_scene)(normals)[:, 0], np.exp(FROM_ABOVE), rtol=1e-5
     )
+
+
+def test_glass_is_darker_than_the_paint_of_dark_cars():
+    paint = np.array([0.2, 0.15, 0.1], np.float32)
+    dark = with_paints(default_palette(), {Part.PAINT: paint}, GREY)
+    white = with_paints(default_palette(), {Part.PAINT: np.ones(3, np.float32)}, GREY)
+
+    assert dark[Part.GLASS].mean() == pytest.approx(0.8 * 0.15)
+    np.testing.assert_array_equal(white[Part.GLASS], default_palette()[Part.GLASS])
