@@ -32,8 +32,9 @@ from real2sim_proto.operations import Delete, Duplicate, Operation, Rotate, Tran
 from real2sim_server.demo.run import SCENE, worker_process
 from real2sim_server.demo.street import DURATION_S, TRAINING_HZ, record_street, unpack_street
 from real2sim_server.edit import ScenarioState, apply_operations, instances_at, posed_instances
+from real2sim_server.geometry import apply_transform
 from real2sim_server.render import render_cameras
-from real2sim_server.scene import Fisheye, Scene, Shutter
+from real2sim_server.scene import Camera, Fisheye, Scene, Shutter
 from real2sim_server.scene.io import load_scene
 from real2sim_server.synthetic import SyntheticConfig, SyntheticLog, generate_log
 
@@ -287,10 +288,12 @@ def portrait(log: SyntheticLog, track: int, t_us: int, yaw: float) -> np.ndarray
 
 
 def jam(work: Path, _: Path) -> None:
-    """``jam.jpg``: the car ahead in a KITTI drive, which was only ever seen from behind."""
+    """``jam.jpg``: the car ahead in a KITTI drive, which was only ever seen from behind, with
+    close-ups of its flank, and of its wheels, shadow and ground.
+    """
     log, scene = os.environ["KITTI_LOG"], work / "jam"
     if not scene.exists():
-        sizes = ["--width", "1242", "--iterations", "4000", "--preset", "cpu-small"]
+        sizes = ["--width", "1242", "--iterations", "3000", "--preset", "cpu-small"]
         command("reconstruct", log, "--out", scene, *sizes)
     loaded = load_scene(scene)
     car, times = "car_0", loaded.frame_times_us
@@ -298,11 +301,11 @@ def jam(work: Path, _: Path) -> None:
         "as recorded": [],
         "turned by 35 degrees": [Rotate(object_id=car, angle=np.radians(35))],
         "turned by 90 degrees": [Rotate(object_id=car, angle=np.radians(90))],
+        "turned by 180 degrees": [Rotate(object_id=car, angle=np.radians(180))],
         "moved": [Translate(object_id=car, x=4, y=1.2, frame="object", snap=True)],
-        "duplicated": [Duplicate(object_id=car, x=-1.5, y=2.9, frame="object", snap=True)],
         "deleted": [Delete(object_id=car)],
     }
-    edits("jam.jpg", loaded, int(times[len(times) // 2]), rows)
+    edits("jam.jpg", loaded, int(times[len(times) // 2]), rows, width=1242, near=car)
 
 
 def edits(
@@ -312,9 +315,15 @@ def edits(
     rows: dict[str, list[Operation]],
     *,
     rows_shown: slice = slice(None),
+    width: int = 960,
+    near: str | None = None,
 ) -> None:
-    """What the first camera sees after each of some batches of operations, one above the other."""
-    camera, vehicle = scene.rig.cameras[0].resized(960), scene.ego.transform(t_us)
+    """What the first camera sees after each of some batches of operations, one above the other.
+
+    ``near`` names an object; two parts of each picture follow at twice the size, about its middle
+    and about the ground below it.
+    """
+    camera, vehicle = scene.rig.cameras[0].resized(width), scene.ego.transform(t_us)
     recorded, pictures = ScenarioState.of(scene), []
     for caption, operations in rows.items():
         state = apply_operations(recorded, operations).state
@@ -325,8 +334,34 @@ def edits(
         cv2.putText(
             shown, caption, (10, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (235,) * 3, 1, cv2.LINE_AA
         )
-        pictures += [shown, np.full((6, 960, 3), 255, np.uint8)]
-    save(name, np.concatenate(pictures[:-1]), width=960)
+        gap = np.full((6, width, 3), 255, np.uint8)
+        if near is not None:
+            subject = state.objects[near]
+            middle = subject.trajectory.transform(t_us)[:3, 3]
+            bottom = middle - [0, 0, subject.size[2] / 2]
+            parts = close_ups(shown, camera, vehicle, np.stack([middle, bottom]))
+            pictures += [shown, parts, gap]
+        else:
+            pictures += [shown, gap]
+    save(name, np.concatenate(pictures[:-1]), width=width)
+
+
+def close_ups(
+    picture: np.ndarray, camera: Camera, vehicle: np.ndarray, points: np.ndarray
+) -> np.ndarray:
+    """Parts of a picture about world points [N, 3], at twice the size, side by side."""
+    pixels, _ = camera.project(apply_transform(camera.viewmat(vehicle), points))
+    height, width = picture.shape[:2]
+    half = np.array([width // (4 * len(points)), height // 5])
+    parts = []
+    for at in pixels:
+        x, y = np.clip(np.round(at).astype(int) - half, 0, [width, height] - 2 * half)
+        part = picture[y : y + 2 * half[1], x : x + 2 * half[0]]
+        parts.append(cv2.resize(part, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC))
+    strip = np.full((parts[0].shape[0], width, 3), 255, np.uint8)
+    joined = np.concatenate(parts, axis=1)
+    strip[:, : joined.shape[1]] = joined
+    return strip
 
 
 PICTURES = {

@@ -22,7 +22,6 @@ from ..render.lens import TOLERANCE
 from ..render.types import Instance
 from ..scene import Figure, GaussianCloud, Lidar, Scene, Stride, Trajectory
 from ..scene.cloud import SH_C0
-from ..scene.sunlight import sunshine_of
 from .appearance import (
     inpaint_ground,
     lamp_cloud,
@@ -140,7 +139,7 @@ def _standing(
         return Instance(cloud, *placement, semantic=semantic)
     recorded = scene.object(subject.source_id)
     colour = recorded.colour
-    sunshine = sunshine_of(scene) if subject.edited and cloud is recorded.cloud else None
+    sunshine = scene.sunshine if subject.edited and cloud is recorded.cloud else None
     if sunshine is not None and transform is not None:
         track = recorded.trajectory
         there = track.transform(min(max(t_us, track.start_us), track.end_us))
@@ -181,7 +180,7 @@ def cast_shadows(
             subject.scale,
             subject.scaled_size,
             scene.ground,
-            sunshine=sunshine_of(scene),
+            sunshine=scene.sunshine,
         )
         for subject, transform in placed
         if not _as_recorded(scene, subject, transform, t_us)
@@ -249,7 +248,7 @@ def composed_background(
         return scene.background
 
     def make() -> GaussianCloud:
-        background, sunshine = scene.background, sunshine_of(scene)
+        background, sunshine = scene.background, scene.sunshine
         if sunshine is not None and (left or moved):
             background = without_shadows(scene, background, left + moved, sunshine)
         if left:

@@ -263,7 +263,7 @@ NEIGHBOURS = 24
 STEPS = 4
 """Steps of the share of the sun, as for directions above."""
 
-GAIN_RANGE = (0.4, 2.5)
+GAIN_RANGE = (0.33, 3.0)
 """Limits of the change of brightness."""
 
 

@@ -23,7 +23,7 @@ from .ground import Ground, of_bundle
 from .ground_fit import fit_scene_ground
 from .lane_graph import LaneGraph
 from .lidar_surfaces import LidarSurfaces
-from .sunlight import Sunlight
+from .sunlight import Sunlight, Sunshine
 from .trajectory import Trajectory
 
 # Sky.
@@ -324,6 +324,13 @@ class Scene:
         if self.content_hash:
             return of_bundle(self.content_hash, self._fit_ground)
         return self._fit_ground()
+
+    @cached_property
+    def sunshine(self) -> Sunshine | None:
+        """Where the sun shines on the ground; None without sunlight."""
+        if self.sunlight is None:
+            return None
+        return Sunshine.on(self.sunlight, self.background, self.ground, self.objects.values())
 
     def _fit_ground(self) -> Ground:
         return fit_scene_ground(self.background, self.ego, self.objects.values())

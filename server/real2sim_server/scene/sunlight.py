@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
-from weakref import WeakKeyDictionary
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry import Float, invert_transform
-from .cloud import SH_C0, UNSEEN
-from .coverage import LOW
+from .cloud import SH_C0, GaussianCloud
+from .coverage import LOW, SEEN
 from .errors import SceneError
+from .ground import Ground
 from .ground_fit import pull_push
 from .trajectory import Trajectory
-
-if TYPE_CHECKING:
-    from .scene import Scene
 
 Size = tuple[float, float, float]
 
@@ -108,8 +104,23 @@ LUMA = np.array([0.2126, 0.7152, 0.0722])
 DISPLAY = 2.2
 """Exponent from display values to light."""
 
+MIN_SHADE = 0.4
+"""Minimum brightness of upward surfaces in the shade, relative to the sun."""
+
 SIDE_LIGHT = 0.7
 """Light of the sky on upright surfaces, relative to level ground."""
+
+
+class Boxed(Protocol):
+    """An object with a box that moves."""
+
+    @property
+    def size(self) -> Size:
+        """(length, width, height) [m]."""
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """``T_world_object`` over time."""
 
 
 class Sunshine:
@@ -137,6 +148,21 @@ class Sunshine:
         self._usual = pull_push(mean.astype(np.float32), weights.astype(np.float32))
         self._lit = _lit(self._usual, counts.reshape(shape) > 0, sun)
 
+    @classmethod
+    def on(
+        cls, sun: Sunlight, background: GaussianCloud, ground: Ground, objects: Iterable[Boxed]
+    ) -> Sunshine:
+        """The sunshine on the ground of a scene, without the lasting shadows of its objects."""
+        means = background.means.cpu().double().numpy()
+        shown = (background.opacities > 0.3).cpu().numpy() & ground.covers(means[:, :2])
+        shown &= np.abs(means[:, 2] - ground.height_at(means[:, :2])) < LOW
+        if background.uncertainties is not None:
+            shown &= background.uncertainties.cpu().numpy() < SEEN
+        colours = (background.sh[:, 0].cpu().numpy()[shown] * SH_C0 + 0.5).clip(0, 1)
+        points = means[shown]
+        clear = ~lasting_shadows(objects, points, sun)
+        return cls(sun, points[clear, :2], colours[clear])
+
     def lit(self, places: Float) -> Float:
         """Share [N] of the sun that reaches the ground at ``places`` [N, 2] [m]."""
         return self._at(self._lit, places)
@@ -158,17 +184,24 @@ class Sunshine:
         return np.asarray(colours * (1 - share) + lit * share)
 
     def brightness(self, normals: Float, lit: float) -> NDArray[np.float32]:
-        """Brightness [N, 1] of surfaces, 1 on sunlit level ground, as display values.
+        """Brightness [N, 3] of surfaces, 1 on sunlit level ground, as display values.
+
+        In the shade, surfaces that face the sky have its hue. The others also get light from the
+        ground, which is white.
 
         Args:
             normals: [N, 3] unit, outwards, in the world.
             lit: share of the sun that reaches them.
         """
-        shade = float(self.sun.shade @ LUMA) ** DISPLAY
-        facing = (normals @ self.sun.towards).clip(0) / self.sun.towards[2]
-        sky = SIDE_LIGHT + (1 - SIDE_LIGHT) * normals[:, 2]
-        light = sky * shade + lit * facing * (1 - shade)
-        return np.asarray(light ** (1 / DISPLAY), np.float32)[:, None]
+        up = normals[:, 2:]
+        # Cameras clip the light and the dark; vehicles have less contrast than their shadows.
+        grey = float(self.sun.shade @ LUMA)
+        shade = (self.sun.shade * max(1.0, MIN_SHADE / grey)) ** DISPLAY
+        grey = max(grey, MIN_SHADE) ** DISPLAY
+        facing = (normals @ self.sun.towards).clip(0)[:, None] / self.sun.towards[2]
+        hue = (shade / grey) ** (0.5 + 0.5 * up)
+        light = (SIDE_LIGHT + (1 - SIDE_LIGHT) * up) * grey * hue + lit * facing * (1 - shade)
+        return np.asarray(light ** (1 / DISPLAY), np.float32)
 
     def _at(self, values: NDArray[np.float32], places: Float) -> Float:
         from scipy.ndimage import map_coordinates
@@ -199,43 +232,8 @@ def _lit(
     return np.asarray(np.clip((smooth - edge) / (0.4 * contrast) + 0.5, 0, 1), np.float32)
 
 
-_made: WeakKeyDictionary[Scene, Sunshine] = WeakKeyDictionary()
-_making = threading.Lock()
-
-
-def sunshine_of(scene: Scene) -> Sunshine | None:
-    """Where the sun shines in a scene; None without sunlight. Computed once."""
-    sun = scene.sunlight
-    if sun is None:
-        return None
-    with _making:
-        if scene not in _made:
-            _made[scene] = _from_background(scene, sun)
-        return _made[scene]
-
-
-def _from_background(scene: Scene, sun: Sunlight) -> Sunshine:
-    cloud = scene.background
-    means = cloud.means.cpu().double().numpy()
-    shown = (cloud.opacities > 0.3).cpu().numpy() & scene.ground.covers(means[:, :2])
-    shown &= np.abs(means[:, 2] - scene.ground.height_at(means[:, :2])) < LOW
-    if cloud.uncertainties is not None:
-        shown &= cloud.uncertainties.cpu().numpy() < 0.8 * UNSEEN
-    colours = (cloud.sh[:, 0].cpu().numpy()[shown] * SH_C0 + 0.5).clip(0, 1)
-    points = means[shown]
-    clear = ~lasting_shadows(scene.objects.values(), points, sun)
-    return Sunshine(sun, points[clear, :2], colours[clear])
-
-
-class _Boxed(Protocol):
-    @property
-    def size(self) -> Size: ...
-    @property
-    def trajectory(self) -> Trajectory: ...
-
-
 def lasting_shadows(
-    objects: Iterable[_Boxed], points: Float, sun: Sunlight, *, share: float = LASTING
+    objects: Iterable[Boxed], points: Float, sun: Sunlight, *, share: float = LASTING
 ) -> NDArray[np.bool_]:
     """[N] bool, ``points`` [N, 3] on the ground in or near the shadow of one of the objects for
     more than ``share`` of its recorded time.

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from ...geometry import Float
 from ...scene import Scene, SceneObject
-from ...scene.sunlight import sunshine_of
 from ...synthetic.vehicles import VehicleShape, roof_heights
 from .surfels import MIN_OBSERVED, modal_colour
 
@@ -75,7 +74,7 @@ def light_on(item: SceneObject, scene: Scene) -> Light:
 
     That of the sun, if it is known, otherwise the fitted slopes.
     """
-    sunshine = sunshine_of(scene)
+    sunshine = scene.sunshine
     axes = item.trajectory.middle[:3, :3]
     if sunshine is not None:
         lit = sunshine.lit_along(item.trajectory)

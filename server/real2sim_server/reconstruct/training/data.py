@@ -20,7 +20,7 @@ from .schedule import TrainOptions
 
 NEAR, FAR = 0.5, 80.0
 """Range of the compared LiDAR depths [m]."""
-SKY_BORDER = 3.0
+SKY_BORDER = 1.5
 """Width of the border of the sky mask with reduced weight [px]."""
 PREFETCH = 4
 """Number of images decoded ahead of their step."""
