@@ -116,14 +116,14 @@ class PerturbedDrive:
 
     def sweep_at(self, lidar: Lidar, t_us: int) -> SweepTargets:
         """See :class:`Drive`."""
-        met = self.base.sweep_at(lidar, t_us)
+        targets = self.base.sweep_at(lidar, t_us)
         times = t_us + lidar.beams.slots[0]
         ends = [self.offset_at(round(t)) for t in (times[0], times[-1])]
         span = [times[0], max(times[-1], times[0] + 1)]
         lateral, heading = (np.interp(times, span, pair) for pair in zip(*ends, strict=True))
         mount = lidar.T_vehicle_lidar
-        ego = self._moved(met.T_world_lidar @ invert_transform(mount), lateral, heading)
-        return SweepTargets(met.scene, ego @ mount)
+        ego = self._moved(targets.T_world_lidar @ invert_transform(mount), lateral, heading)
+        return SweepTargets(targets.scene, ego @ mount)
 
     def offset_at(self, t_us: int) -> tuple[float, float]:
         """Lateral offset from the path, to the left [m], and heading offset [rad]."""

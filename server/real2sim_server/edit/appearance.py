@@ -1,12 +1,11 @@
-"""Appearance of edits: ground under removed objects, lamps, lighting."""
+"""Appearance of edits: ground that objects leave, and lamps."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import lru_cache
-from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
@@ -19,11 +18,10 @@ from ..geometry import Float, invert_transform
 from ..scene import UNSEEN, GaussianCloud, Scene
 from ..scene.cloud import SH_C0
 from ..scene.coverage import LOW, MARGIN
-from ..scene.ground_fit import pull_push
-from ..scene.sunlight import Sunshine, lasting_shadows
+from ..scene.ground_fit import Size, cell_means, pull_push
+from ..scene.sunlight import LightMap, lasting_shadows
+from .light import Colour, Recent
 from .state import ObjectState, ScenarioState
-
-Colour = tuple[float, float, float]
 
 PARKED = 0.5
 """An object is parked if all its recorded positions are within this distance of each other [m];
@@ -43,7 +41,7 @@ MIN_POINTS, MIN_CELLS = 6, 3
 """Minimum number of known Gaussians, and of known cells in a strip."""
 
 BRIEF = 0.1
-"""Share of an object's time in which its shadow must be at a place to be looked for in the ground.
+"""The recorded shadow of an object is looked for where it is for more than this share of its time.
 """
 
 
@@ -67,7 +65,7 @@ def vacated_parking(state: ScenarioState, poses: Mapping[str, Float]) -> tuple[s
     )
 
 
-def vacated_lanes(state: ScenarioState) -> tuple[str, ...]:
+def off_track(state: ScenarioState) -> tuple[str, ...]:
     """Ids of recorded moving objects that are deleted or move elsewhere."""
     return tuple(
         recorded.object_id
@@ -78,15 +76,16 @@ def vacated_lanes(state: ScenarioState) -> tuple[str, ...]:
     )
 
 
-def without_shadows(
-    scene: Scene, background: GaussianCloud, left: Iterable[str], sunshine: Sunshine
-) -> GaussianCloud:
+def without_shadows(scene: Scene, background: GaussianCloud, left: Iterable[str]) -> GaussianCloud:
     """The background without the recorded shadows of objects ``left`` on the ground.
 
     Raises:
         UnknownObjectError: ``scene`` has no such object.
     """
-    sh, sun = background.sh.clone(), sunshine.sun
+    light_map = scene.light_map
+    if light_map is None:
+        return background
+    sh, sun = background.sh.clone(), light_map.sun
     points = background.means.cpu().double().numpy()
     height = np.abs(points[:, 2] - scene.ground.height_at(points[:, :2]))
     level = np.flatnonzero(height <= LOW)
@@ -94,7 +93,7 @@ def without_shadows(
         item = scene.object(object_id)
         dark = level[lasting_shadows([item], points[level], sun, share=BRIEF)]
         rows = torch.from_numpy(dark).to(sh.device)
-        _relight(sh, rows, points[dark, :2], sunshine)
+        _relight(sh, rows, points[dark, :2], light_map)
     return replace(background, sh=sh)
 
 
@@ -145,10 +144,10 @@ def _away(pose: Float, parked: ObjectState) -> bool:
     return math.hypot(x - (low_x + high_x) / 2, y - (low_y + high_y) / 2) > AWAY
 
 
-def _relight(sh: Tensor, rows: Tensor, places: Float, sunshine: Sunshine) -> None:
+def _relight(sh: Tensor, rows: Tensor, places: Float, light_map: LightMap) -> None:
     """Take an object's shadow out of ``sh`` of the ground's Gaussians ``rows`` [M], in place."""
     colours = (sh[rows, 0] * SH_C0 + 0.5).cpu().double().numpy()
-    lit = torch.from_numpy(sunshine.without_shadow(colours, places)).to(sh)
+    lit = torch.from_numpy(light_map.without_shadow(colours, places)).to(sh)
     gain = lit / (sh[rows, 0] * SH_C0 + 0.5).clamp(min=0.01)
     sh[rows] = sh[rows] * gain[:, None]
     sh[rows, 0] = (lit - 0.5) / SH_C0
@@ -176,13 +175,12 @@ def _continue_ground(
 
     sides = half.cpu().double().numpy()
     low = -sides - RIM
-    shape = tuple(np.ceil(-2 * low / CELL).astype(int))
+    rows, columns = np.ceil(-2 * low / CELL).astype(int)
+    shape = int(rows), int(columns)
     at = np.floor((places[known].cpu().double().numpy() - low) / CELL).astype(int)
     cells = np.ravel_multi_index(at.clip(0, np.array(shape) - 1).T, shape)
     colours = (sh[known, 0] * SH_C0 + 0.5).clamp(0, 1).cpu().double().numpy()
-    counts = np.bincount(cells, minlength=shape[0] * shape[1]).reshape(shape)
-    sums = [np.bincount(cells, colours[:, c], shape[0] * shape[1]) for c in range(3)]
-    mean = np.stack(sums, -1).reshape(*shape, 3) / counts.clip(1)[..., None]
+    mean, counts = cell_means(colours, cells, shape)
     joined = [_join(mean, counts > 0, axis, sides[axis]) for axis in (0, 1)]
     lines, _ = min(joined, key=lambda pair: pair[1])
     rest = np.where((counts > 0)[..., None], mean - lines, 0).astype(np.float32)
@@ -236,17 +234,17 @@ LAMP_HEIGHT = 0.55, 0.9
 LAMP_SPREAD = (0.025, 0.065, 0.05)
 """Standard deviations of a lamp along the axes of the object [m]."""
 
+KEPT_LAMPS = 8
+"""Number of cached combinations of lit lamps per body."""
+
 BEYOND_BODY = 0.03
 """Distance of lamps from the surface of the body [m]."""
 
-_lamp_clouds: WeakKeyDictionary[GaussianCloud, dict[Hashable, GaussianCloud]] = WeakKeyDictionary()
+_lamp_clouds: Recent[GaussianCloud, GaussianCloud] = Recent(KEPT_LAMPS)
 
 
 def lamp_cloud(
-    body: GaussianCloud,
-    scale: tuple[float, float, float],
-    size: tuple[float, float, float],
-    lamps: tuple[Lamp, ...],
+    body: GaussianCloud, scale: Size, size: Size, lamps: tuple[Lamp, ...]
 ) -> GaussianCloud:
     """The light of ``lamps`` in the frame of the object, already scaled. Cached.
 
@@ -256,9 +254,10 @@ def lamp_cloud(
         size: (length, width, height) of the scaled box [m].
         lamps: the lit lamps.
     """
-    known, key = _lamp_clouds.setdefault(body, {}), (scale, size, lamps)
-    if key in known:
-        return known[key]
+    return _lamp_clouds.get(body, (scale, size, lamps), lambda: _glow(body, scale, size, lamps))
+
+
+def _glow(body: GaussianCloud, scale: Size, size: Size, lamps: tuple[Lamp, ...]) -> GaussianCloud:
     points = (
         body.means[body.opacities > 0.5].cpu().double() * torch.tensor(scale).double()
     ).numpy()
@@ -281,8 +280,7 @@ def lamp_cloud(
         opacities=torch.full((count,), 0.99),
         sh=((torch.tensor(colours) - 0.5) / SH_C0)[:, None].contiguous(),
     )
-    known[key] = light.to(body.device)
-    return known[key]
+    return light.to(body.device)
 
 
 def _corners(lamp: Lamp) -> list[tuple[float, float]]:
@@ -301,87 +299,3 @@ def _surface(points: Float, end: float, y: float, z: float, length: float) -> fl
     x = end * points[:, 0]
     near = (abs(points[:, 1:] - (y, z)) < 0.12).all(axis=1) & (x > length / 6)
     return min(float(np.quantile(x[near], 0.95)), length / 2) if near.any() else length / 2
-
-
-# --- Lighting ------------------------------------------------------------------------------------
-
-AROUND = 20.0
-"""Distance around the ego's path in which the background gives the ambient light [m]."""
-
-HEIGHTS = (-2.0, 6.0)
-"""The same below and above the path, to include the street but not the tree tops [m]."""
-
-GAIN_RANGE = (0.5, 2.0)
-"""Limits of colour factors; larger corrections are more likely to be errors of the estimate."""
-
-LUMA = (0.2126, 0.7152, 0.0722)
-
-
-def ambient_colour(scene: Scene) -> Colour:
-    """Mean colour of the street around the ego's path, weighted by the Gaussians' visible area."""
-    cloud = scene.background
-    path = torch.from_numpy(scene.ego.positions).to(cloud.means)
-    low, high = path.min(dim=0).values, path.max(dim=0).values
-    reach = torch.tensor([AROUND, AROUND, 0.0]).to(cloud.means)
-    below, above = (torch.tensor([0.0, 0.0, h]).to(cloud.means) for h in HEIGHTS)
-    near = (cloud.means >= low - reach + below) & (cloud.means <= high + reach + above)
-    chosen = near.all(dim=1)
-    mean = mean_colour(cloud.select(chosen)) if bool(chosen.any()) else mean_colour(cloud)
-    return mean or (0.5, 0.5, 0.5)
-
-
-def mean_colour(cloud: GaussianCloud) -> Colour | None:
-    """Mean RGB of a cloud, each Gaussian weighted by opacity and area; None if it is invisible."""
-    if not len(cloud):
-        return None
-    largest = cloud.scales.double().topk(2, dim=1).values.prod(dim=1)
-    weights = cloud.opacities.double() * largest
-    if float(weights.sum()) <= 0:
-        return None
-    rgb = (cloud.sh[:, 0].double() * SH_C0 + 0.5).clamp(0.0, 1.0)
-    red, green, blue = ((rgb * weights[:, None]).sum(dim=0) / weights.sum()).tolist()
-    return (red, green, blue)
-
-
-def relighting_gain(scene: Scene, cloud: GaussianCloud, ambient: Colour | None) -> Colour:
-    """Factors on the colours of an asset that adapt it to the light of ``scene``.
-
-    If the light of the asset's recording is known, they are the ratio of the two ambient colours.
-    Otherwise the brightness is matched to the scene's own objects; the tint does not change.
-
-    Args:
-        scene: scene that receives the asset.
-        cloud: Gaussians of the asset.
-        ambient: ambient colour of the asset's source, see :func:`ambient_colour`.
-    """
-    if ambient is not None:
-        here = ambient_colour(scene)
-        red, green, blue = (_bounded(h / max(a, 1e-3)) for h, a in zip(here, ambient, strict=True))
-        return (red, green, blue)
-    own = mean_colour(cloud)
-    others = [mean_colour(o.cloud) for o in scene.objects.values()]
-    lumas = [_luma(colour) for colour in others if colour is not None]
-    if own is None or not lumas:
-        return (1.0, 1.0, 1.0)
-    factor = _bounded(float(np.median(lumas)) / max(_luma(own), 1e-3))
-    return (factor, factor, factor)
-
-
-def relit(cloud: GaussianCloud, gain: Colour) -> GaussianCloud:
-    """The cloud with its colours multiplied by ``gain``; the same object if ``gain`` is 1."""
-    if gain == (1.0, 1.0, 1.0):
-        return cloud
-    factors: Tensor = torch.tensor(gain).to(cloud.sh)
-    sh = cloud.sh * factors
-    # The renderer adds 0.5 to the harmonics; this constant must be multiplied too.
-    sh[:, 0] += (factors - 1.0) * 0.5 / SH_C0
-    return replace(cloud, sh=sh)
-
-
-def _luma(colour: Colour) -> float:
-    return sum(w * c for w, c in zip(LUMA, colour, strict=True))
-
-
-def _bounded(factor: float) -> float:
-    low, high = GAIN_RANGE
-    return min(high, max(low, factor))

@@ -25,7 +25,7 @@ from ..scene.cloud import SH_C0
 from .appearance import (
     inpaint_ground,
     lamp_cloud,
-    vacated_lanes,
+    off_track,
     vacated_parking,
     without_shadows,
 )
@@ -35,7 +35,6 @@ from .state import ObjectState, ScenarioState
 from .tracks import PlacedObjects
 
 NO_STRIDES: Mapping[str, Stride] = MappingProxyType({})
-NO_POSES: Mapping[str, Float] = MappingProxyType({})
 KEPT_BACKGROUNDS = 4
 """Number of cached backgrounds with erased regions per scene; each costs 4 bytes per Gaussian, and
 its colours as well if parked objects were moved.
@@ -100,7 +99,7 @@ def instances_of(
     as_recorded = all(state.objects.get(name) is known for name, known in state.recorded.items())
     if state.erased or not as_recorded or any(subject.edited for subject in shown):
         return None
-    return (Instance(scene.background), *_anywhere(scene, shown))
+    return (Instance(scene.background), *_anywhere(scene, shown, {}))
 
 
 def instances_at_start(scene: Scene, state: ScenarioState) -> list[Instance]:
@@ -114,7 +113,7 @@ def instances_at_start(scene: Scene, state: ScenarioState) -> list[Instance]:
 
 
 def _anywhere(
-    scene: Scene, objects: Iterable[ObjectState], poses: Mapping[str, Float] = NO_POSES
+    scene: Scene, objects: Iterable[ObjectState], poses: Mapping[str, Float]
 ) -> Iterable[Instance]:
     """Objects in the light of their ``poses``, or as recorded without one."""
     return (
@@ -139,14 +138,15 @@ def _standing(
         return Instance(cloud, *placement, semantic=semantic)
     recorded = scene.object(subject.source_id)
     colour = recorded.colour
-    sunshine = scene.sunshine if subject.edited and cloud is recorded.cloud else None
-    if sunshine is not None and transform is not None:
+    light_map = scene.light_map if subject.edited and cloud is recorded.cloud else None
+    if light_map is not None and transform is not None:
         track = recorded.trajectory
         there = track.transform(min(max(t_us, track.start_us), track.end_us))
-        lit = sunshine.lit(there[None, :2, 3])[0] if colour else sunshine.lit_along(track)
-        was = _heading(there), float(lit)
-        now = _heading(transform), float(sunshine.lit(transform[None, :2, 3])[0])
-        cloud, colour = shaded(cloud, colour, was, now, sunshine)
+        before, after = light_map.lit(np.array([there[:2, 3], transform[:2, 3]])).tolist()
+        # Without a colour that changes over time, the cloud has the mean of its recorded light.
+        before = before if colour else light_map.lit_along(track)
+        was, now = (_heading(there), before), (_heading(transform), after)
+        cloud, colour = shaded(cloud, colour, was, now, light_map.sun)
     return Instance(cloud, *placement, colour=colour, t_us=t_us, semantic=semantic)
 
 
@@ -180,7 +180,7 @@ def cast_shadows(
             subject.scale,
             subject.scaled_size,
             scene.ground,
-            sunshine=scene.sunshine,
+            light_map=scene.light_map,
         )
         for subject, transform in placed
         if not _as_recorded(scene, subject, transform, t_us)
@@ -243,16 +243,13 @@ def composed_background(
     All other tensors are shared.
     """
     erased, left = state.erased, vacated_parking(state, poses)
-    moved = vacated_lanes(state) if scene.sunlight is not None else ()
+    moved = off_track(state) if scene.sunlight is not None else ()
     if not erased and not left and not moved:
         return scene.background
 
     def make() -> GaussianCloud:
-        background, sunshine = scene.background, scene.sunshine
-        if sunshine is not None and (left or moved):
-            background = without_shadows(scene, background, left + moved, sunshine)
-        if left:
-            background = inpaint_ground(scene, background, left)
+        background = without_shadows(scene, scene.background, left + moved)
+        background = inpaint_ground(scene, background, left) if left else background
         return without_regions(background, erased) if erased else background
 
     return _backgrounds.get(scene, (erased, left, moved), make)

@@ -1,4 +1,4 @@
-"""Shadows and shading of edited objects.
+"""Light of edits: shadows and shading of moved objects, and the light of assets.
 
 Shadows of recorded objects are part of the recorded colours. Each edited object gets its own layer
 of dark Gaussians on the ground: its silhouette along the sun, where the sun shines, and a soft
@@ -29,11 +29,12 @@ from ..geometry import (
     yaw_quaternion,
 )
 from ..render.types import Instance
-from ..scene import GaussianCloud, Ground, Sunlight, TimeColour
+from ..scene import GaussianCloud, Ground, Scene, Sunlight, TimeColour
 from ..scene.cloud import SH_C0
-from ..scene.sunlight import Sunshine
+from ..scene.ground_fit import Size
+from ..scene.sunlight import LUMA, LightMap
 
-Size = tuple[float, float, float]
+Colour = tuple[float, float, float]
 
 CELL = 0.12
 """Spacing of a shadow's Gaussians [m]; wider for large shadows."""
@@ -88,7 +89,7 @@ class Recent(Generic[K, V]):
     """
 
     def __init__(self, limit: int) -> None:
-        self._limit, self._lock = limit, threading.RLock()
+        self._limit, self._lock = limit, threading.Lock()
         self._held: WeakKeyDictionary[K, OrderedDict[Hashable, V]] = WeakKeyDictionary()
 
     def get(self, owner: K, key: Hashable, make: Callable[[], V]) -> V:
@@ -121,8 +122,7 @@ class _Silhouette:
 
     def places(self) -> Float:
         """Centres [X, Y, 2] of the cells."""
-        x, y = (np.arange(n) + 0.5 for n in self.covered.shape)
-        return self.low + self.cell * np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
+        return _centres(self.low, self.cell, self.covered.shape)
 
 
 def cast_shadow(
@@ -132,7 +132,7 @@ def cast_shadow(
     size: Size,
     ground: Ground,
     *,
-    sunshine: Sunshine | None = None,
+    light_map: LightMap | None = None,
 ) -> Instance | None:
     """The shadow of an object on the ground; None if there is none.
 
@@ -142,7 +142,7 @@ def cast_shadow(
         scale: scale of the cloud.
         size: (length, width, height) of the scaled box [m].
         ground: ground below the box.
-        sunshine: sun of the scene; None casts only a contact shadow.
+        light_map: of the scene; None casts only a contact shadow.
     """
     bottom = bottom_centres(T_world_object[None], size)[0]
     clearance = max(0.0, float(bottom[2]) - ground.height(float(bottom[0]), float(bottom[1])))
@@ -150,7 +150,7 @@ def cast_shadow(
     forward = T_world_object[:3, 0]
     heading = float(np.arctan2(forward[1], forward[0]))
     level = transform_from([*bottom[:2], 0.0], yaw_quaternion(heading))
-    sun = None if sunshine is None else sunshine.sun
+    sun = None if light_map is None else light_map.sun
     found = _silhouette(cloud, scale, size, sun, heading)
     if sun is not None:
         # The shadow of an object in the air is away from it.
@@ -158,9 +158,9 @@ def cast_shadow(
     places = found.places().reshape(-1, 2)
     world = apply_transform(level, np.column_stack([places, np.zeros(len(places))]))
     dark = np.asarray(contact * found.contact.ravel(), np.float64)
-    if sunshine is not None:
-        shade = float(sunshine.sun.shade.min())
-        hidden = (1 - shade) * found.covered.ravel() * sunshine.lit(world[:, :2])
+    if light_map is not None:
+        shade = float(light_map.sun.shade.min())
+        hidden = (1 - shade) * found.covered.ravel() * light_map.lit(world[:, :2])
         dark = 1 - (1 - dark) * (1 - hidden)
     kept = dark > MIN_OPACITY
     if not kept.any():
@@ -247,12 +247,17 @@ def _made(points: Float | None, size: Size, way: Float) -> _Silhouette:
         closed = cv2.morphologyEx(np.pad(covered, width), cv2.MORPH_CLOSE, closing)
         soft = cv2.GaussianBlur(closed, (0, 0), PENUMBRA / cell)
         covered = np.asarray(soft[width:-width, width:-width], np.float32)
-    made = _Silhouette(low, cell, covered, np.zeros(0, np.float32))
-    x, y = (np.abs(made.places()) / (2 * half + 2 * SHADOW_MARGIN)).transpose(2, 0, 1)
+    outline = 2 * half + 2 * SHADOW_MARGIN
+    x, y = (np.abs(_centres(low, cell, covered.shape)) / outline).transpose(2, 0, 1)
     inside = np.clip((0.5 - np.maximum(x, y)) / 0.2, 0.0, 1.0)
     corner = np.clip((0.62 - np.hypot(x, y)) / 0.2, 0.0, 1.0)
     contact = (inside * inside * (3 - 2 * inside) * corner).astype(np.float32)
     return _Silhouette(low, cell, covered, contact)
+
+
+def _centres(low: Float, cell: float, shape: tuple[int, ...]) -> Float:
+    x, y = (np.arange(n) + 0.5 for n in shape)
+    return np.asarray(low + cell * np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1))
 
 
 # --- Shading -------------------------------------------------------------------------------------
@@ -263,7 +268,7 @@ NEIGHBOURS = 24
 STEPS = 4
 """Steps of the share of the sun, as for directions above."""
 
-GAIN_RANGE = (0.33, 3.0)
+SHADING_RANGE = (0.33, 3.0)
 """Limits of the change of brightness."""
 
 
@@ -276,7 +281,7 @@ def shaded(
     colour: TimeColour | None,
     was: tuple[float, float],
     now: tuple[float, float],
-    sunshine: Sunshine,
+    sun: Sunlight,
 ) -> tuple[GaussianCloud, TimeColour | None]:
     """The cloud of an object under changed light, and its change over time.
 
@@ -284,7 +289,7 @@ def shaded(
         cloud: in the frame of the object.
         colour: its change over time.
         was, now: heading [rad] and share of the sun when recorded, and after the edit.
-        sunshine: sun of the scene.
+        sun: sun of the scene.
     """
     steps = tuple((round(heading / TURN), round(STEPS * lit)) for heading, lit in (was, now))
     if steps[0] == steps[1]:
@@ -293,13 +298,15 @@ def shaded(
     def make() -> tuple[GaussianCloud, TimeColour | None]:
         normals = _normals.get(cloud, None, lambda: _outward(cloud))
         before, after = (
-            sunshine.brightness(
+            sun.brightness(
                 normals @ quaternion_to_matrix(yaw_quaternion(turn * TURN)).T, lit / STEPS
             )
             for turn, lit in steps
         )
-        gain = torch.from_numpy(np.clip(after / before, *GAIN_RANGE)).to(cloud.sh)
-        return _brightened(cloud, colour, gain)
+        gain = torch.from_numpy(np.clip(after / before, *SHADING_RANGE)).to(cloud.sh)
+        if colour is None:
+            return relit(cloud, gain), None
+        return relit(cloud, gain), replace(colour, coefficients=colour.coefficients * gain[:, None])
 
     return _shadings.get(cloud, steps, make)
 
@@ -326,12 +333,85 @@ def _outward(cloud: GaussianCloud) -> Float:
     return np.asarray(normals)
 
 
-def _brightened(
-    cloud: GaussianCloud, colour: TimeColour | None, gain: Tensor
-) -> tuple[GaussianCloud, TimeColour | None]:
-    sh = cloud.sh * gain[:, None]
+# --- Light of assets -----------------------------------------------------------------------------
+
+AROUND = 20.0
+"""Distance around the ego's path in which the background gives the ambient light [m]."""
+
+HEIGHTS = (-2.0, 6.0)
+"""The same below and above the path, to include the street but not the tree tops [m]."""
+
+GAIN_RANGE = (0.5, 2.0)
+"""Limits of colour factors; larger corrections are more likely to be errors of the estimate."""
+
+
+def ambient_colour(scene: Scene) -> Colour:
+    """Mean colour of the street around the ego's path, weighted by the Gaussians' visible area."""
+    cloud = scene.background
+    path = torch.from_numpy(scene.ego.positions).to(cloud.means)
+    low, high = path.min(dim=0).values, path.max(dim=0).values
+    reach = torch.tensor([AROUND, AROUND, 0.0]).to(cloud.means)
+    below, above = (torch.tensor([0.0, 0.0, h]).to(cloud.means) for h in HEIGHTS)
+    near = (cloud.means >= low - reach + below) & (cloud.means <= high + reach + above)
+    chosen = near.all(dim=1)
+    mean = mean_colour(cloud.select(chosen)) if bool(chosen.any()) else mean_colour(cloud)
+    return mean or (0.5, 0.5, 0.5)
+
+
+def mean_colour(cloud: GaussianCloud) -> Colour | None:
+    """Mean RGB of a cloud, each Gaussian weighted by opacity and area; None if it is invisible."""
+    if not len(cloud):
+        return None
+    largest = cloud.scales.double().topk(2, dim=1).values.prod(dim=1)
+    weights = cloud.opacities.double() * largest
+    if float(weights.sum()) <= 0:
+        return None
+    rgb = (cloud.sh[:, 0].double() * SH_C0 + 0.5).clamp(0.0, 1.0)
+    red, green, blue = ((rgb * weights[:, None]).sum(dim=0) / weights.sum()).tolist()
+    return (red, green, blue)
+
+
+def relighting_gain(scene: Scene, cloud: GaussianCloud, ambient: Colour | None) -> Colour:
+    """Factors on the colours of an asset that adapt it to the light of ``scene``.
+
+    If the light of the asset's recording is known, they are the ratio of the two ambient colours.
+    Otherwise the brightness is matched to the scene's own objects; the tint does not change.
+
+    Args:
+        scene: scene that receives the asset.
+        cloud: Gaussians of the asset.
+        ambient: ambient colour of the asset's source, see :func:`ambient_colour`.
+    """
+    if ambient is not None:
+        here = ambient_colour(scene)
+        red, green, blue = (_bounded(h / max(a, 1e-3)) for h, a in zip(here, ambient, strict=True))
+        return (red, green, blue)
+    own = mean_colour(cloud)
+    others = [mean_colour(o.cloud) for o in scene.objects.values()]
+    lumas = [_luma(colour) for colour in others if colour is not None]
+    if own is None or not lumas:
+        return (1.0, 1.0, 1.0)
+    factor = _bounded(float(np.median(lumas)) / max(_luma(own), 1e-3))
+    return (factor, factor, factor)
+
+
+def relit(cloud: GaussianCloud, gain: Colour | Tensor) -> GaussianCloud:
+    """The cloud with its colours multiplied by ``gain``, for all or [N, 3] for each Gaussian; the
+    same object if ``gain`` is 1.
+    """
+    factors = torch.as_tensor(gain).to(cloud.sh)
+    if bool((factors == 1).all()):
+        return cloud
+    sh = cloud.sh * factors.unsqueeze(-2)
     # The renderer adds 0.5 to the harmonics; this constant must be multiplied too.
-    sh[:, 0] += (gain - 1) * 0.5 / SH_C0
-    if colour is not None:
-        colour = replace(colour, coefficients=colour.coefficients * gain[:, None])
-    return replace(cloud, sh=sh), colour
+    sh[:, 0] += (factors - 1.0) * 0.5 / SH_C0
+    return replace(cloud, sh=sh)
+
+
+def _luma(colour: Colour) -> float:
+    return float(LUMA @ colour)
+
+
+def _bounded(factor: float) -> float:
+    low, high = GAIN_RANGE
+    return min(high, max(low, factor))

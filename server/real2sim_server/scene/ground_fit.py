@@ -47,6 +47,23 @@ def pull_push(values: NDArray[np.float32], weights: NDArray[np.float32]) -> NDAr
     return np.asarray(filled, dtype=np.float32)
 
 
+def cell_means(
+    values: NDArray[Any], cells: NDArray[np.int64], shape: tuple[int, int]
+) -> tuple[Float, NDArray[np.int64]]:
+    """Mean values [H, W, C] and counts [H, W] in the cells of a grid; 0 in empty cells.
+
+    Args:
+        values: [N, C].
+        cells: [N], flat index of the cell of each value.
+        shape: (H, W).
+    """
+    count = shape[0] * shape[1]
+    counts = np.bincount(cells, minlength=count)
+    sums = np.stack([np.bincount(cells, column, count) for column in values.T], axis=-1)
+    mean = sums / np.maximum(counts, 1)[:, None]
+    return mean.reshape(*shape, -1), counts.reshape(shape)
+
+
 def _halve(
     values: NDArray[np.float32], weights: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

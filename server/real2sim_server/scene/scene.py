@@ -23,7 +23,7 @@ from .ground import Ground, of_bundle
 from .ground_fit import fit_scene_ground
 from .lane_graph import LaneGraph
 from .lidar_surfaces import LidarSurfaces
-from .sunlight import Sunlight, Sunshine
+from .sunlight import LightMap, Sunlight
 from .trajectory import Trajectory
 
 # Sky.
@@ -326,11 +326,11 @@ class Scene:
         return self._fit_ground()
 
     @cached_property
-    def sunshine(self) -> Sunshine | None:
-        """Where the sun shines on the ground; None without sunlight."""
+    def light_map(self) -> LightMap | None:
+        """Sunlit and shaded ground; None without sunlight."""
         if self.sunlight is None:
             return None
-        return Sunshine.on(self.sunlight, self.background, self.ground, self.objects.values())
+        return LightMap.of(self.sunlight, self.background, self.ground, self.objects.values())
 
     def _fit_ground(self) -> Ground:
         return fit_scene_ground(self.background, self.ego, self.objects.values())

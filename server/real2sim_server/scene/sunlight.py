@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,10 +13,8 @@ from .cloud import SH_C0, GaussianCloud
 from .coverage import LOW, SEEN
 from .errors import SceneError
 from .ground import Ground
-from .ground_fit import pull_push
+from .ground_fit import Size, Standing, cell_means, pull_push
 from .trajectory import Trajectory
-
-Size = tuple[float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +49,26 @@ class Sunlight:
         halves = (np.array(size) / 2 + margin)[None]
         return boxes_hit(points, self.towards, invert_transform(T_world_box)[None], halves)
 
+    def brightness(self, normals: Float, lit: float) -> NDArray[np.float32]:
+        """Brightness [N, 3] of surfaces, 1 on sunlit level ground, as display values.
+
+        In the shade, surfaces that face up have the hue of the sky. The others also get light that
+        the ground reflects, which is white.
+
+        Args:
+            normals: [N, 3] unit, outwards, in the world.
+            lit: share of the sun that reaches them.
+        """
+        up = normals[:, 2:]
+        # Cameras clip the light and the dark; vehicles have less contrast than their shadows.
+        grey = float(self.shade @ LUMA)
+        shade = (self.shade * max(1.0, MIN_SHADE / grey)) ** DISPLAY
+        grey = max(grey, MIN_SHADE) ** DISPLAY
+        facing = (normals @ self.towards).clip(0)[:, None] / self.towards[2]
+        hue = (shade / grey) ** (0.5 + 0.5 * up)
+        light = (SIDE_LIGHT + (1 - SIDE_LIGHT) * up) * grey * hue + lit * facing * (1 - shade)
+        return np.asarray(light ** (1 / DISPLAY), np.float32)
+
 
 def boxes_hit(points: Float, rays: Float, boxes: Float, halves: Float) -> NDArray[np.bool_]:
     """[N] bool, whether rays from points hit a box.
@@ -81,11 +98,11 @@ CELL = 0.4
 """Edge of the cells in which ground counts as sunlit or not [m]."""
 
 SHADOW_REACH = 0.3
-"""Ground this close to the lasting shadow of an object does not decide [m]."""
+"""Margin around the shadows of boxes, for their soft edges [m]."""
 
 LASTING = 0.3
-"""Share of an object's time in which its shadow must be at a place to become part of the recorded
-ground: that of a parked car, or of one in a traffic jam."""
+"""A shadow that is at a place for more than this share of its object's time is part of the recorded
+ground: that of a parked car, or of a car in a traffic jam."""
 
 POSES = 16
 """Number of compared poses of a moving object."""
@@ -111,20 +128,8 @@ SIDE_LIGHT = 0.7
 """Light of the sky on upright surfaces, relative to level ground."""
 
 
-class Boxed(Protocol):
-    """An object with a box that moves."""
-
-    @property
-    def size(self) -> Size:
-        """(length, width, height) [m]."""
-
-    @property
-    def trajectory(self) -> Trajectory:
-        """``T_world_object`` over time."""
-
-
-class Sunshine:
-    """Where the sun shines on the ground, from the brightness of the ground.
+class LightMap:
+    """Sunlit and shaded ground of a scene, from the brightness of the ground.
 
     Attributes:
         sun: the sun.
@@ -140,19 +145,17 @@ class Sunshine:
         self._low = places.min(axis=0) if len(places) else np.zeros(2)
         at = ((places - self._low) / CELL).astype(np.int64)
         shape = tuple(at.max(axis=0) + 1) if len(places) else (1, 1)
-        cells = np.ravel_multi_index(at.T, shape)
-        counts = np.bincount(cells, minlength=shape[0] * shape[1])
-        sums = [np.bincount(cells, colours[:, c], len(counts)) for c in range(3)]
-        mean = (np.stack(sums, -1) / counts.clip(1)[:, None]).reshape(*shape, 3)
-        weights = np.minimum(counts / 3, 1).reshape(shape)
-        self._usual = pull_push(mean.astype(np.float32), weights.astype(np.float32))
-        self._lit = _lit(self._usual, counts.reshape(shape) > 0, sun)
+        cells = np.asarray(np.ravel_multi_index(at.T, shape))
+        mean, counts = cell_means(colours, cells, shape)
+        weights = np.minimum(counts / 3, 1).astype(np.float32)
+        self._usual = pull_push(mean.astype(np.float32), weights)
+        self._lit = _lit(self._usual, counts > 0, sun)
 
     @classmethod
-    def on(
-        cls, sun: Sunlight, background: GaussianCloud, ground: Ground, objects: Iterable[Boxed]
-    ) -> Sunshine:
-        """The sunshine on the ground of a scene, without the lasting shadows of its objects."""
+    def of(
+        cls, sun: Sunlight, background: GaussianCloud, ground: Ground, objects: Iterable[Standing]
+    ) -> LightMap:
+        """The map of a scene, without the lasting shadows of its objects."""
         means = background.means.cpu().double().numpy()
         shown = (background.opacities > 0.3).cpu().numpy() & ground.covers(means[:, :2])
         shown &= np.abs(means[:, 2] - ground.height_at(means[:, :2])) < LOW
@@ -182,26 +185,6 @@ class Sunshine:
         share = (np.clip((dark - 0.25) / 0.5, 0, 1) * self.lit(places))[:, None]
         lit = usual * ((colours / self.sun.shade) @ LUMA / (usual @ LUMA).clip(0.01))[:, None]
         return np.asarray(colours * (1 - share) + lit * share)
-
-    def brightness(self, normals: Float, lit: float) -> NDArray[np.float32]:
-        """Brightness [N, 3] of surfaces, 1 on sunlit level ground, as display values.
-
-        In the shade, surfaces that face the sky have its hue. The others also get light from the
-        ground, which is white.
-
-        Args:
-            normals: [N, 3] unit, outwards, in the world.
-            lit: share of the sun that reaches them.
-        """
-        up = normals[:, 2:]
-        # Cameras clip the light and the dark; vehicles have less contrast than their shadows.
-        grey = float(self.sun.shade @ LUMA)
-        shade = (self.sun.shade * max(1.0, MIN_SHADE / grey)) ** DISPLAY
-        grey = max(grey, MIN_SHADE) ** DISPLAY
-        facing = (normals @ self.sun.towards).clip(0)[:, None] / self.sun.towards[2]
-        hue = (shade / grey) ** (0.5 + 0.5 * up)
-        light = (SIDE_LIGHT + (1 - SIDE_LIGHT) * up) * grey * hue + lit * facing * (1 - shade)
-        return np.asarray(light ** (1 / DISPLAY), np.float32)
 
     def _at(self, values: NDArray[np.float32], places: Float) -> Float:
         from scipy.ndimage import map_coordinates
@@ -233,7 +216,7 @@ def _lit(
 
 
 def lasting_shadows(
-    objects: Iterable[Boxed], points: Float, sun: Sunlight, *, share: float = LASTING
+    objects: Iterable[Standing], points: Float, sun: Sunlight, *, share: float = LASTING
 ) -> NDArray[np.bool_]:
     """[N] bool, ``points`` [N, 3] on the ground in or near the shadow of one of the objects for
     more than ``share`` of its recorded time.

@@ -9,7 +9,7 @@ import torch
 from real2sim_proto.base import Pose
 from real2sim_proto.operations import Delete, Duplicate, EraseRegion, Scale, Translate
 from real2sim_server.edit import ScenarioState, apply_operations, instances_at
-from real2sim_server.edit.appearance import relit
+from real2sim_server.edit.light import relit
 from real2sim_server.scene import Scene, SceneObject
 from real2sim_server.scene.errors import UnknownObjectError
 

@@ -14,7 +14,7 @@ from real2sim_server.edit.light import cast_shadow
 from real2sim_server.geometry import transform_from, yaw_quaternion
 from real2sim_server.scene import GaussianCloud, Ground, Scene, SceneObject, Sunlight, Trajectory
 from real2sim_server.scene.cloud import SH_C0
-from real2sim_server.scene.sunlight import Sunshine
+from real2sim_server.scene.sunlight import LightMap
 
 SIZE = (4.0, 2.0, 2.0)
 SUN = Sunlight(np.array([-0.6, 0.0, 0.8]), np.array([0.5, 0.5, 0.5]))
@@ -56,18 +56,18 @@ def darkness(shadow, x: float, y: float) -> float:
     return float(1 - np.prod(1 - hidden))
 
 
-def sunny(lit: float = 1.0) -> Sunshine:
+def sunny(lit: float = 1.0) -> LightMap:
     """Ground that is sunlit for y < 20 m, or in the shade there."""
     x, y = np.meshgrid(np.arange(-20, 20, 0.2), np.arange(-20, 40, 0.2), indexing="ij")
     places = np.stack([x.ravel(), y.ravel()], axis=1)
     bright = np.where((places[:, 1] < 20) == (lit > 0), 0.5, 0.25)
-    return Sunshine(SUN, places, np.repeat(bright[:, None], 3, axis=1).astype(np.float32))
+    return LightMap(SUN, places, np.repeat(bright[:, None], 3, axis=1).astype(np.float32))
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.7])
 def test_shadows_fall_away_from_the_sun_however_an_object_is_turned(yaw):
     pose = transform_from([0.0, 0.0, 1.0], yaw_quaternion(yaw))
-    shadow = cast_shadow(pose, block(), ONE, SIZE, Ground.level(0.0), sunshine=sunny())
+    shadow = cast_shadow(pose, block(), ONE, SIZE, Ground.level(0.0), light_map=sunny())
 
     # The edge of the top, 2 m high, lands 1.5 m further along x.
     edge = min(2 / np.cos(yaw), 1 / np.sin(yaw) if yaw else np.inf)
@@ -78,7 +78,7 @@ def test_shadows_fall_away_from_the_sun_however_an_object_is_turned(yaw):
 
 def test_shadows_of_flying_objects_are_away_from_them():
     pose = transform_from([0.0, 0.0, 5.0], [1.0, 0.0, 0.0, 0.0])
-    shadow = cast_shadow(pose, block(), ONE, SIZE, Ground.level(0.0), sunshine=sunny())
+    shadow = cast_shadow(pose, block(), ONE, SIZE, Ground.level(0.0), light_map=sunny())
 
     assert darkness(shadow, 3.0 + 0.75, 0) == pytest.approx(0.5, abs=0.05)
     assert darkness(shadow, 0.0, 0) < 0.02
@@ -87,7 +87,7 @@ def test_shadows_of_flying_objects_are_away_from_them():
 def test_objects_in_the_shade_cast_only_a_contact_shadow():
     pose = transform_from([0.0, 0.0, 1.0], [1.0, 0.0, 0.0, 0.0])
     ground = Ground.level(0.0)
-    shade = cast_shadow(pose, block(), ONE, SIZE, ground, sunshine=sunny(lit=0.0))
+    shade = cast_shadow(pose, block(), ONE, SIZE, ground, light_map=sunny(lit=0.0))
     overcast = cast_shadow(pose, block(), ONE, SIZE, ground)
 
     for x in (0.0, 2.2, 3.2):
@@ -101,7 +101,7 @@ def test_shadows_lie_on_kerbs():
     heights[:, 21:] = 0.12
     ground = Ground(np.array([-10.0, -10.0]), 0.5, heights, np.ones((40, 40), np.bool_))
     pose = transform_from([0.0, 0.0, 1.0], [1.0, 0.0, 0.0, 0.0])
-    shadow = cast_shadow(pose, block(), ONE, SIZE, ground, sunshine=sunny())
+    shadow = cast_shadow(pose, block(), ONE, SIZE, ground, light_map=sunny())
 
     places = shadow.cloud.means.double().numpy()
     above = places[:, 2] - ground.height_at(places[:, :2])

@@ -11,7 +11,7 @@ from real2sim_server.geometry import transform_from
 from real2sim_server.scene import Sunlight, Trajectory
 from real2sim_server.scene.errors import SceneError
 from real2sim_server.scene.io import load_scene, read_packed, save_scene, write_packed
-from real2sim_server.scene.sunlight import Sunshine, lasting_shadows
+from real2sim_server.scene.sunlight import LightMap, lasting_shadows
 
 SHADE = np.array([0.5, 0.55, 0.6])
 SUN = Sunlight(np.array([-0.6, 0.0, 0.8]), SHADE)
@@ -48,11 +48,11 @@ def test_a_box_shades_the_ground_away_from_the_sun():
 
 
 def ground(bright):
-    """A Sunshine on 40 m x 40 m of ground whose brightness depends on x, y."""
+    """A LightMap on 40 m x 40 m of ground whose brightness depends on x, y."""
     x, y = np.meshgrid(np.arange(0, 40, 0.2), np.arange(0, 40, 0.2), indexing="ij")
     places = np.stack([x.ravel(), y.ravel()], axis=1)
     colours = np.repeat(bright(places)[:, None], 3, axis=1).astype(np.float32)
-    return Sunshine(SUN, places, colours)
+    return LightMap(SUN, places, colours)
 
 
 def test_dark_ground_is_in_the_shade_and_bright_ground_in_the_sun():
@@ -84,16 +84,16 @@ def test_level_ground_has_brightness_one_in_the_sun_and_that_of_shadows_in_the_s
     sunny = ground(lambda places: np.full(len(places), 0.5))
     up = np.array([[0.0, 0, 1]])
 
-    np.testing.assert_allclose(sunny.brightness(up, 1.0), [[1.0] * 3], atol=1e-6)
-    np.testing.assert_allclose(sunny.brightness(up, 0.0), [SHADE], atol=1e-6)
+    np.testing.assert_allclose(sunny.sun.brightness(up, 1.0), [[1.0] * 3], atol=1e-6)
+    np.testing.assert_allclose(sunny.sun.brightness(up, 0.0), [SHADE], atol=1e-6)
 
 
 def test_the_side_towards_the_sun_is_brighter_only_in_the_sun():
     sunny = ground(lambda places: np.full(len(places), 0.5))
     sides = np.array([[-1.0, 0, 0], [1.0, 0, 0]])
 
-    towards, away = sunny.brightness(sides, 1.0)
-    shaded = sunny.brightness(sides, 0.0)
+    towards, away = sunny.sun.brightness(sides, 1.0)
+    shaded = sunny.sun.brightness(sides, 0.0)
 
     assert (towards > 1.2 * away).all()
     np.testing.assert_allclose(shaded[0], shaded[1])

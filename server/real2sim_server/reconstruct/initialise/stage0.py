@@ -18,7 +18,7 @@ from ...maps import laid_on, lanes_of_log
 from ...scene import GaussianCloud, Ground, Scene, SceneObject, Sky
 from ...scene.cloud import SH_C0
 from ...scene.ground_fit import DrivenPath, GroundFit, box_bottoms, fit_ground
-from ...scene.sunlight import Sunlight, Sunshine, lasting_shadows
+from ...scene.sunlight import LightMap, Sunlight, lasting_shadows
 from ..logged_view import sky_mask
 from ..options import InitialiseOptions, OnProgress, ReconstructError, Stages
 from .accumulate import (
@@ -379,12 +379,12 @@ def _inpaint(
     filled[structure] = fill_from_neighbours(
         points[structure], colours[structure], known[structure], prior.colour(height, intensity)
     )
-    sunshine = None
+    light_map = None
     if sunlight is not None:
         places, shown = points[ground].astype(np.float64), known[ground]
         shown = shown & ~lasting_shadows(log.tracks, places, sunlight)
-        sunshine = Sunshine(sunlight, places[shown, :2], colours[ground][shown])
-    return _inpaint_objects(log, parts, filled, known, sunshine)
+        light_map = LightMap(sunlight, places[shown, :2], colours[ground][shown])
+    return _inpaint_objects(log, parts, filled, known, light_map)
 
 
 def _inpaint_objects(
@@ -392,7 +392,7 @@ def _inpaint_objects(
     parts: _SurfelSet,
     colours: NDArray[np.float32],
     known: NDArray[np.bool_],
-    sunshine: Sunshine | None,
+    light_map: LightMap | None,
 ) -> tuple[NDArray[np.float32], dict[str, Any]]:
     """Fill the unseen body of each object from its seen part, then its underside, in place.
 
@@ -424,9 +424,9 @@ def _inpaint_objects(
             surfaces.append(
                 VehicleSurface(parts.surfels.points[mine], normals, colours[mine], seen, body)
             )
-            if sunshine is not None:
-                lit = sunshine.lit_along(track.trajectory)
-                lights.append(partial(sunshine.brightness, lit=lit))
+            if light_map is not None:
+                lit = light_map.lit_along(track.trajectory)
+                lights.append(partial(light_map.sun.brightness, lit=lit))
     filled, light, palette = fill_vehicles(surfaces, lights or None)
     for k, found in zip(closed, filled, strict=True):
         colours[members[k]] = found

@@ -102,10 +102,10 @@ def fit_sunlight(log: DrivingLog, ground: Ground) -> Sunlight | None:
         slope = -float(shadow @ grey)
         return slope * abs(slope) / total if total > 0 else 0.0
 
-    towards = max((direction(a, e) for a in AZIMUTHS for e in ELEVATIONS), key=explained)
+    towards = max((_direction(a, e) for a in AZIMUTHS for e in ELEVATIONS), key=explained)
     azimuth, elevation = np.arctan2(towards[1], towards[0]), np.arcsin(towards[2])
     towards = max(
-        (direction(azimuth + a, elevation + e) for a in FINE for e in FINE), key=explained
+        (_direction(azimuth + a, elevation + e) for a in FINE for e in FINE), key=explained
     )
     shade = _shade(colours, _shadows(views, towards), cells, counts)
     share = explained(towards) / max(float(grey @ grey), 1e-9)
@@ -114,7 +114,7 @@ def fit_sunlight(log: DrivingLog, ground: Ground) -> Sunlight | None:
     return Sunlight(towards, shade.clip(0.01, 0.99))
 
 
-def direction(azimuth: float, elevation: float) -> Float:
+def _direction(azimuth: float, elevation: float) -> Float:
     """Unit vector [3] towards the sun, in the world."""
     flat = np.cos(elevation)
     return np.array([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
@@ -155,7 +155,7 @@ def _view(log: DrivingLog, ground: Ground, camera: Camera, frame: int) -> _View:
 
 
 def _chosen(views: list[_View]) -> list[_View]:
-    """Places that are near a moving vehicle in some image, at most MAX_SAMPLES times."""
+    """Places that are near a moving vehicle in some image, thinned to about MAX_SAMPLES samples."""
     near = np.unique(np.concatenate([np.zeros(0, np.int64), *(v.cells[v.near] for v in views)]))
     views = [v.select(np.isin(v.cells, near)) for v in views]
     total = sum(len(v.cells) for v in views)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ...geometry import Float, matrix_to_quaternion
 from ...scene import Ground
-from ...scene.ground_fit import GroundFit, pull_push
+from ...scene.ground_fit import GroundFit, cell_means, pull_push
 
 # Surfels: flat along the local surface, large enough to close its gaps.
 
@@ -382,11 +382,7 @@ def fill_ground(
     cell = np.floor((points[:, :2] - surface.origin) / surface.cell).astype(np.int64)
     rows, columns = np.clip(cell, 0, np.array(shape) - 1).T
     flat = np.asarray(np.ravel_multi_index((rows, columns), shape))
-    counts = np.bincount(flat[known], minlength=shape[0] * shape[1])
-    sums = np.stack(
-        [np.bincount(flat[known], colours[known, c], shape[0] * shape[1]) for c in range(3)], -1
-    )
-    mean = (sums / np.maximum(counts, 1)[:, None]).astype(np.float32).reshape(*shape, 3)
-    weights = np.minimum(counts / 2, 1).astype(np.float32).reshape(shape)
-    raster = pull_push(mean, weights)
+    mean, counts = cell_means(colours[known], flat[known], (shape[0], shape[1]))
+    weights = np.minimum(counts / 2, 1).astype(np.float32)
+    raster = pull_push(mean.astype(np.float32), weights)
     return np.where(known[:, None], colours, raster.reshape(-1, 3)[flat])

@@ -74,11 +74,11 @@ def light_on(item: SceneObject, scene: Scene) -> Light:
 
     That of the sun, if it is known, otherwise the fitted slopes.
     """
-    sunshine = scene.sunshine
+    light_map = scene.light_map
     axes = item.trajectory.middle[:3, :3]
-    if sunshine is not None:
-        lit = sunshine.lit_along(item.trajectory)
-        return lambda normals: sunshine.brightness(normals @ axes.T, lit)
+    if light_map is not None:
+        lit = light_map.lit_along(item.trajectory)
+        return lambda normals: light_map.sun.brightness(normals @ axes.T, lit)
     reconstruction = scene.provenance.get("reconstruction")
     known = reconstruction.get(LIGHT) if isinstance(reconstruction, dict) else None
     slopes = np.array(FROM_ABOVE if known is None else known, dtype=np.float64)

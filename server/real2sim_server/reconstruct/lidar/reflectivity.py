@@ -150,11 +150,11 @@ def fit_reflectivity(table: SurfaceTable, lit: LitRays) -> FittedReflectivity:
             gain, offset = _responses(lit, explained, cells)
     stopped = np.bincount(lit.member, lit.share, len(table))
     table.uncertainties[:] = UNSEEN / (1 + stopped)
-    met = stopped > 0
+    hit = stopped > 0
     off = lit.intensity - explained * gain[lit.cell] - offset[lit.cell]
     table.attributes[:, 0] = np.clip(values, DARKEST, MAX_REFLECTIVITY)
-    if met.any():
-        table.attributes[~met, 0] = np.median(table.attributes[met, 0])
+    if hit.any():
+        table.attributes[~hit, 0] = np.median(table.attributes[hit, 0])
     response = None
     if len(lit.rings):
         shape = (len(lit.rings), len(RANGE_STEPS) - 1)
@@ -164,7 +164,7 @@ def fit_reflectivity(table: SurfaceTable, lit: LitRays) -> FittedReflectivity:
             offset.reshape(shape).astype(np.float32),
         )
     residual = float(np.sqrt(np.mean(off**2))) if len(off) else float("nan")
-    return FittedReflectivity(incidence, response, float(met.mean()), residual)
+    return FittedReflectivity(incidence, response, float(hit.mean()), residual)
 
 
 def stopped_shares(

@@ -184,7 +184,8 @@ def _press(
     """Move Gaussians ``rows`` [M] along ``directions`` [M, 3] onto a surface, in place.
 
     A shear along the rays reduces the depth about the surface to KEPT_DEPTH of its value. Seen
-    along the rays, centres and outlines stay in place.
+    along the rays, centres stay in place, and so do outlines, except of Gaussians that would get
+    longer than they were.
     """
     gaussians = model.gaussians
     rays = normalize(directions, dim=-1).cpu()

@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 from real2sim_proto import ErrorCode
 from real2sim_proto.scenes import AssetInfo, AssetUpload
 
-from ...edit.appearance import Colour, ambient_colour, relighting_gain, relit
-from ...edit.light import cast_shadow
+from ...edit.light import Colour, ambient_colour, cast_shadow, relighting_gain, relit
 from ...geometry import Float, invert_transform
 from ...render import Backend, Instance, RasterOptions, rasterize
 from ...scene import Asset, BundleError, Figure, GaussianCloud, Ground, Scene, Trajectory
