@@ -140,18 +140,8 @@ def _standing(
     colour = recorded.colour
     light_map = scene.light_map if subject.edited and cloud is recorded.cloud else None
     if light_map is not None and transform is not None:
-        track = recorded.trajectory
-        there = track.transform(min(max(t_us, track.start_us), track.end_us))
-        before, after = light_map.lit(np.array([there[:2, 3], transform[:2, 3]])).tolist()
-        # Without a colour that changes over time, the cloud has the mean of its recorded light.
-        before = before if colour else light_map.lit_along(track)
-        was, now = (_heading(there), before), (_heading(transform), after)
-        cloud, colour = shaded(cloud, colour, was, now, light_map.sun)
+        cloud, colour = shaded(recorded, transform, t_us, light_map)
     return Instance(cloud, *placement, colour=colour, t_us=t_us, semantic=semantic)
-
-
-def _heading(transform: Float) -> float:
-    return float(np.arctan2(transform[1, 0], transform[0, 0]))
 
 
 def lamps_on(

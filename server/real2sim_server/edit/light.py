@@ -24,12 +24,11 @@ from ..geometry import (
     Float,
     apply_transform,
     bottom_centres,
-    quaternion_to_matrix,
     transform_from,
     yaw_quaternion,
 )
 from ..render.types import Instance
-from ..scene import GaussianCloud, Ground, Scene, Sunlight, TimeColour
+from ..scene import GaussianCloud, Ground, Scene, SceneObject, Sunlight, TimeColour
 from ..scene.cloud import SH_C0
 from ..scene.ground_fit import Size
 from ..scene.sunlight import LUMA, LightMap
@@ -265,8 +264,11 @@ def _centres(low: Float, cell: float, shape: tuple[int, ...]) -> Float:
 NEIGHBOURS = 24
 """Number of neighbours that give the normal of a Gaussian."""
 
-STEPS = 4
-"""Steps of the share of the sun, as for directions above."""
+PLACE = 0.25
+"""Shadings are cached for positions in these steps [m]."""
+
+POSES = 8
+"""Number of recorded poses for the mean light of an object."""
 
 SHADING_RANGE = (0.33, 3.0)
 """Limits of the change of brightness."""
@@ -274,41 +276,57 @@ SHADING_RANGE = (0.33, 3.0)
 
 _shadings: Recent[GaussianCloud, tuple[GaussianCloud, TimeColour | None]] = Recent(KEPT_SHADINGS)
 _normals: Recent[GaussianCloud, Float] = Recent(1)
+_usual_light: Recent[GaussianCloud, Float] = Recent(1)
 
 
 def shaded(
-    cloud: GaussianCloud,
-    colour: TimeColour | None,
-    was: tuple[float, float],
-    now: tuple[float, float],
-    sun: Sunlight,
+    item: SceneObject, T_world_object: Float, t_us: int, light_map: LightMap
 ) -> tuple[GaussianCloud, TimeColour | None]:
-    """The cloud of an object under changed light, and its change over time.
+    """The Gaussians of a recorded object at another pose in its light, and their change over time.
 
     Args:
-        cloud: in the frame of the object.
-        colour: its change over time.
-        was, now: heading [rad] and share of the sun when recorded, and after the edit.
-        sun: sun of the scene.
+        item: recorded object.
+        T_world_object: [4, 4] float64 pose of the box centre.
+        t_us: time [us].
+        light_map: of the scene.
     """
-    steps = tuple((round(heading / TURN), round(STEPS * lit)) for heading, lit in (was, now))
+    cloud, colour, track = item.cloud, item.colour, item.trajectory
+    recorded = track.transform(min(max(t_us, track.start_us), track.end_us))
+    steps = tuple(_step(pose) for pose in (recorded, T_world_object))
     if steps[0] == steps[1]:
         return cloud, colour
 
     def make() -> tuple[GaussianCloud, TimeColour | None]:
         normals = _normals.get(cloud, None, lambda: _outward(cloud))
-        before, after = (
-            sun.brightness(
-                normals @ quaternion_to_matrix(yaw_quaternion(turn * TURN)).T, lit / STEPS
-            )
-            for turn, lit in steps
-        )
+        points = cloud.means.cpu().double().numpy()
+        height = item.size[2] / 2
+
+        def lit(pose: Float) -> Float:
+            return light_map.lit_above(apply_transform(pose, points), points[:, 2] + height)
+
+        def usual() -> Float:
+            times = np.linspace(track.start_us, track.end_us, POSES if track.moves else 1)
+            return np.asarray(np.mean([lit(track.transform(int(t))) for t in times], axis=0))
+
+        was = _usual_light.get(cloud, None, usual)
+        if colour is not None:
+            # Sides that no image shows have the mean light at all times.
+            varies = (colour.coefficients != 0).flatten(1).any(1).cpu().numpy()
+            was = np.where(varies, lit(recorded), was)
+        sun = light_map.sun
+        before = sun.brightness(normals @ recorded[:3, :3].T, was)
+        after = sun.brightness(normals @ T_world_object[:3, :3].T, lit(T_world_object))
         gain = torch.from_numpy(np.clip(after / before, *SHADING_RANGE)).to(cloud.sh)
         if colour is None:
             return relit(cloud, gain), None
         return relit(cloud, gain), replace(colour, coefficients=colour.coefficients * gain[:, None])
 
     return _shadings.get(cloud, steps, make)
+
+
+def _step(pose: Float) -> tuple[int, ...]:
+    heading = np.arctan2(pose[1, 0], pose[0, 0])
+    return (*(round(x / PLACE) for x in pose[:3, 3]), round(heading / TURN))
 
 
 def _outward(cloud: GaussianCloud) -> Float:

@@ -49,7 +49,7 @@ class Sunlight:
         halves = (np.array(size) / 2 + margin)[None]
         return boxes_hit(points, self.towards, invert_transform(T_world_box)[None], halves)
 
-    def brightness(self, normals: Float, lit: float) -> NDArray[np.float32]:
+    def brightness(self, normals: Float, lit: Float | float) -> NDArray[np.float32]:
         """Brightness [N, 3] of surfaces, 1 on sunlit level ground, as display values.
 
         In the shade, surfaces that face up have the hue of the sky. The others also get light that
@@ -57,7 +57,7 @@ class Sunlight:
 
         Args:
             normals: [N, 3] unit, outwards, in the world.
-            lit: share of the sun that reaches them.
+            lit: share of the sun that reaches them, for all or [N].
         """
         up = normals[:, 2:]
         # Cameras clip the light and the dark; vehicles have less contrast than their shadows.
@@ -66,7 +66,8 @@ class Sunlight:
         grey = max(grey, MIN_SHADE) ** DISPLAY
         facing = (normals @ self.towards).clip(0)[:, None] / self.towards[2]
         hue = (shade / grey) ** (0.5 + 0.5 * up)
-        light = (SIDE_LIGHT + (1 - SIDE_LIGHT) * up) * grey * hue + lit * facing * (1 - shade)
+        direct = np.reshape(lit, (-1, 1)) * facing * (1 - shade)
+        light = (SIDE_LIGHT + (1 - SIDE_LIGHT) * up) * grey * hue + direct
         return np.asarray(light ** (1 / DISPLAY), np.float32)
 
 
@@ -169,6 +170,11 @@ class LightMap:
     def lit(self, places: Float) -> Float:
         """Share [N] of the sun that reaches the ground at ``places`` [N, 2] [m]."""
         return self._at(self._lit, places)
+
+    def lit_above(self, points: Float, heights: Float) -> Float:
+        """Share [N] of the sun that reaches ``points`` [N, 3], ``heights`` [N] above the ground."""
+        along = self.sun.towards[:2] / self.sun.towards[2]
+        return self.lit(points[:, :2] - heights[:, None] * along)
 
     def lit_along(self, trajectory: Trajectory) -> float:
         """The mean share over the recorded positions of an object."""

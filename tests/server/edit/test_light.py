@@ -10,7 +10,7 @@ import torch
 
 from real2sim_proto.operations import Rotate, Translate
 from real2sim_server.edit import ScenarioState, apply_operations, instances_at
-from real2sim_server.edit.light import cast_shadow
+from real2sim_server.edit.light import cast_shadow, shaded
 from real2sim_server.geometry import transform_from, yaw_quaternion
 from real2sim_server.scene import GaussianCloud, Ground, Scene, SceneObject, Sunlight, Trajectory
 from real2sim_server.scene.cloud import SH_C0
@@ -158,6 +158,18 @@ def test_a_turned_object_gets_the_light_of_its_new_direction(street):
     # The tail was in the sun, and the nose is now.
     assert (after < 0.9 * before)[middle & (x < -1.9)].all()
     assert (after > 1.1 * before)[middle & (x > 1.9)].all()
+
+
+def test_an_object_at_the_edge_of_the_shade_is_half_dark(street):
+    car = street.objects["car"]
+    across = transform_from([0.0, 20.0, 1.0], yaw_quaternion(np.pi / 2))
+    cloud, _ = shaded(car, across, 0, sunny())
+    before, after = colours(car.cloud), colours(cloud)
+    x, y, z = car.cloud.means.numpy().T
+    roof = (z > 0.99) & (np.abs(y) < 0.7)
+
+    np.testing.assert_allclose(after[roof & (x > -1.7) & (x < -1.2)], before[0], atol=0.02)
+    np.testing.assert_allclose(after[roof & (x > 1.2) & (x < 1.7)], before[0] / 2, atol=0.02)
 
 
 def test_unedited_objects_and_scenes_without_sun_keep_their_colours(street):

@@ -63,6 +63,16 @@ def test_dark_ground_is_in_the_shade_and_bright_ground_in_the_sun():
     np.testing.assert_allclose(lit, [1, 0], atol=0.05)
 
 
+def test_the_shade_of_the_ground_reaches_upwards_along_the_sun():
+    half = ground(lambda places: np.where(places[:, 0] < 20, 0.5, 0.27))
+    points = np.array([[18.0, 10.0, 7.0], [18.0, 10.0, 11.0]])
+
+    # At 4 m, the ray to the sun passes the ground 3 m further along x.
+    lit = half.lit_above(points, np.array([0.0, 4.0]))
+
+    np.testing.assert_allclose(lit, [1, 0], atol=0.1)
+
+
 def test_texture_is_not_shade():
     rng = np.random.default_rng(0)
     rough = ground(lambda places: 0.5 * rng.uniform(0.8, 1.2, len(places)))
