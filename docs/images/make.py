@@ -7,7 +7,7 @@ Chromium on the PATH (or in ``CHROMIUM``) for the studio::
 
 NAME is one of demo, film, scenario, studio, wall, pair, drop, crashes, ground, lenses, cars,
 people, jam; without one, all but jam are made. It takes about twenty minutes on two cores. ``jam``
-trains for another ten, on the KITTI drive whose folder ``KITTI_LOG`` names.
+trains for another twenty, on the KITTI drive whose folder ``KITTI_LOG`` names.
 """
 
 from __future__ import annotations

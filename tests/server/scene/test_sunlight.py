@@ -90,6 +90,18 @@ def test_ground_without_its_shadow_is_as_bright_as_around():
     np.testing.assert_allclose(clear, [[0.5] * 3, [0.5] * 3, [0.9] * 3], atol=1e-6)
 
 
+@pytest.mark.parametrize("dark", [0.3, 0.5, 0.7])
+def test_ground_in_the_soft_edge_of_a_shadow_becomes_no_brighter_than_around(dark):
+    deep = Sunlight(SUN.towards, np.array([0.25, 0.25, 0.25]))
+    x, y = np.meshgrid(np.arange(0, 40, 0.2), np.arange(0, 40, 0.2), indexing="ij")
+    places = np.stack([x.ravel(), y.ravel()], axis=1)
+    sunny = LightMap(deep, places, np.full((len(places), 3), 0.5, np.float32))
+
+    clear = sunny.without_shadow(np.full((1, 3), 0.5 * 0.25**dark), np.full((1, 2), 20.0))
+
+    assert 0.4 < clear.min() <= clear.max() <= 0.55 + 1e-6
+
+
 def test_level_ground_has_brightness_one_in_the_sun_and_that_of_shadows_in_the_shade():
     sunny = ground(lambda places: np.full(len(places), 0.5))
     up = np.array([[0.0, 0, 1]])
