@@ -334,15 +334,13 @@ def edits(
         cv2.putText(
             shown, caption, (10, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (235,) * 3, 1, cv2.LINE_AA
         )
-        gap = np.full((6, width, 3), 255, np.uint8)
+        pictures.append(shown)
         if near is not None:
             subject = state.objects[near]
             middle = subject.trajectory.transform(t_us)[:3, 3]
             bottom = middle - [0, 0, subject.size[2] / 2]
-            parts = close_ups(shown, camera, vehicle, np.stack([middle, bottom]))
-            pictures += [shown, parts, gap]
-        else:
-            pictures += [shown, gap]
+            pictures.append(close_ups(shown, camera, vehicle, np.stack([middle, bottom])))
+        pictures.append(np.full((6, width, 3), 255, np.uint8))
     save(name, np.concatenate(pictures[:-1]), width=width)
 
 

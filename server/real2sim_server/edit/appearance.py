@@ -18,7 +18,7 @@ from ..geometry import Float, invert_transform
 from ..scene import UNSEEN, GaussianCloud, Scene
 from ..scene.cloud import SH_C0
 from ..scene.coverage import LOW, MARGIN
-from ..scene.ground_fit import Size, cell_means, pull_push
+from ..scene.ground_fit import Size, cell_means, pull_push, sample_cells
 from ..scene.sunlight import LightMap, lasting_shadows
 from .light import Colour, Recent
 from .state import ObjectState, ScenarioState
@@ -41,8 +41,7 @@ MIN_POINTS, MIN_CELLS = 6, 3
 """Minimum number of known Gaussians, and of known cells in a strip."""
 
 BRIEF = 0.1
-"""The recorded shadow of an object is looked for where it is for more than this share of its time.
-"""
+"""Recorded shadows are removed where they are for more than this share of their object's time."""
 
 
 def vacated_parking(state: ScenarioState, poses: Mapping[str, Float]) -> tuple[str, ...]:
@@ -171,8 +170,6 @@ def _continue_ground(
     """
     if int(known.sum()) < MIN_POINTS or not bool(unknown.any()):
         return
-    from scipy.ndimage import map_coordinates
-
     sides = half.cpu().double().numpy()
     low = -sides - RIM
     rows, columns = np.ceil(-2 * low / CELL).astype(int)
@@ -186,9 +183,7 @@ def _continue_ground(
     rest = np.where((counts > 0)[..., None], mean - lines, 0).astype(np.float32)
     guess = lines + pull_push(rest, np.minimum(counts, 1).astype(np.float32))
     guess = np.minimum(guess, np.maximum(lines, np.quantile(colours, 0.95, axis=0)))
-    at = (places[unknown].cpu().double().numpy() - low) / CELL - 0.5
-    found = [map_coordinates(guess[..., c], at.T, order=1, mode="nearest") for c in range(3)]
-    colour = np.stack(found, axis=1)
+    colour = sample_cells(guess, (places[unknown].cpu().double().numpy() - low) / CELL)
     sh[unknown] = 0
     sh[unknown, 0] = torch.from_numpy((colour - 0.5) / SH_C0).to(sh)
 

@@ -275,8 +275,7 @@ SHADING_RANGE = (0.33, 3.0)
 
 
 _shadings: Recent[GaussianCloud, tuple[GaussianCloud, TimeColour | None]] = Recent(KEPT_SHADINGS)
-_normals: Recent[GaussianCloud, Float] = Recent(1)
-_usual_light: Recent[GaussianCloud, Float] = Recent(1)
+_surfaces: Recent[GaussianCloud, tuple[Float, Float]] = Recent(1)
 
 
 def shaded(
@@ -297,18 +296,17 @@ def shaded(
         return cloud, colour
 
     def make() -> tuple[GaussianCloud, TimeColour | None]:
-        normals = _normals.get(cloud, None, lambda: _outward(cloud))
         points = cloud.means.cpu().double().numpy()
         height = item.size[2] / 2
 
         def lit(pose: Float) -> Float:
             return light_map.lit_above(apply_transform(pose, points), points[:, 2] + height)
 
-        def usual() -> Float:
-            times = np.linspace(track.start_us, track.end_us, POSES if track.moves else 1)
-            return np.asarray(np.mean([lit(track.transform(int(t))) for t in times], axis=0))
+        def surface() -> tuple[Float, Float]:
+            """Normals, and the mean share of the sun over the recording."""
+            return _outward(cloud), np.mean([lit(pose) for pose in track.spread(POSES)], axis=0)
 
-        was = _usual_light.get(cloud, None, usual)
+        normals, was = _surfaces.get(cloud, light_map, surface)
         if colour is not None:
             # Sides that no image shows have the mean light at all times.
             varies = (colour.coefficients != 0).flatten(1).any(1).cpu().numpy()
@@ -321,7 +319,7 @@ def shaded(
             return relit(cloud, gain), None
         return relit(cloud, gain), replace(colour, coefficients=colour.coefficients * gain[:, None])
 
-    return _shadings.get(cloud, steps, make)
+    return _shadings.get(cloud, (light_map, *steps), make)
 
 
 def _step(pose: Float) -> tuple[int, ...]:

@@ -64,6 +64,17 @@ def cell_means(
     return mean.reshape(*shape, -1), counts.reshape(shape)
 
 
+def sample_cells(values: NDArray[Any], at: Float) -> Float:
+    """Values [N, C] of a grid [H, W, C] at positions [N, 2] in cells, bilinear between the centres
+    of cells; beyond the border, those of the border.
+    """
+    from scipy.ndimage import map_coordinates
+
+    channels = np.moveaxis(values, -1, 0)
+    found = [map_coordinates(c, at.T - 0.5, order=1, mode="nearest") for c in channels]
+    return np.stack(found, axis=-1).astype(np.float64)
+
+
 def _halve(
     values: NDArray[np.float32], weights: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

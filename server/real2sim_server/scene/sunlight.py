@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +14,7 @@ from .cloud import SH_C0, GaussianCloud
 from .coverage import LOW, SEEN
 from .errors import SceneError
 from .ground import Ground
-from .ground_fit import Size, Standing, cell_means, pull_push
+from .ground_fit import Size, Standing, cell_means, pull_push, sample_cells
 from .trajectory import Trajectory
 
 
@@ -26,7 +27,7 @@ class Sunlight:
         shade: [3] float64 in (0, 1), RGB of ground in a vehicle's shadow relative to sunlit ground.
 
     Raises:
-        SceneError: not such values.
+        SceneError: ``towards`` is no unit vector above the horizon, or ``shade`` is out of range.
     """
 
     towards: Float
@@ -83,12 +84,12 @@ def boxes_hit(points: Float, rays: Float, boxes: Float, halves: Float) -> NDArra
     found = np.zeros(len(points), np.bool_)
     for T_box_world, half in zip(boxes, halves, strict=True):
         axes = T_box_world[:3, :3].T
-        starts, ways = points @ axes + T_box_world[:3, 3], rays @ axes
+        starts, directions = points @ axes + T_box_world[:3, 3], rays @ axes
         enter, leave = np.full(len(points), -np.inf), np.full(len(points), np.inf)
         with np.errstate(divide="ignore", invalid="ignore"):
             for axis in range(3):
-                a = (-half[axis] - starts[:, axis]) / ways[..., axis]
-                b = (half[axis] - starts[:, axis]) / ways[..., axis]
+                a = (-half[axis] - starts[:, axis]) / directions[..., axis]
+                b = (half[axis] - starts[:, axis]) / directions[..., axis]
                 enter = np.fmax(enter, np.fmin(a, b))
                 leave = np.fmin(leave, np.fmax(a, b))
         found |= (leave > 0) & (enter < leave)
@@ -172,23 +173,26 @@ class LightMap:
 
     def lit(self, places: Float) -> Float:
         """Share [N] of the sun that reaches the ground at ``places`` [N, 2] [m]."""
-        return self._at(self._lit, places)
+        return self._at(self._lit[..., None], places)[:, 0]
 
     def lit_above(self, points: Float, heights: Float) -> Float:
         """Share [N] of the sun that reaches ``points`` [N, 3], ``heights`` [N] above the ground."""
         along = self.sun.towards[:2] / self.sun.towards[2]
         return self.lit(points[:, :2] - heights[:, None] * along)
 
-    def lit_along(self, trajectory: Trajectory) -> float:
-        """The mean share over the recorded positions of an object."""
-        return float(self.lit(trajectory.positions[:, :2]).mean())
+    def light_along(self, trajectory: Trajectory) -> Callable[[Float], NDArray[np.float32]]:
+        """Brightness [N, 3] of surfaces of an object, in its mean light, by their normals [N, 3] in
+        the world; see :meth:`Sunlight.brightness`.
+        """
+        lit = float(self.lit(trajectory.positions[:, :2]).mean())
+        return partial(self.sun.brightness, lit=lit)
 
     def without_shadow(self, colours: Float, places: Float) -> Float:
         """Colours [N, 3] of ground at ``places`` [N, 2] in the shadow of an object, without it.
 
         Ground that is as bright as usual there does not change. The rest gets the usual hue.
         """
-        usual = np.stack([self._at(self._usual[..., c], places) for c in range(3)], axis=1)
+        usual = self._at(self._usual, places)
         ratio = np.log((colours @ LUMA).clip(0.01) / (usual @ LUMA).clip(0.01))
         dark = ratio / np.log(float(self.sun.shade @ LUMA))
         share = (np.clip((dark - 0.25) / 0.5, 0, 1) * self.lit(places))[:, None]
@@ -198,10 +202,7 @@ class LightMap:
         return np.asarray(np.minimum(colours * (1 - share) + lit * share, limit))
 
     def _at(self, values: NDArray[np.float32], places: Float) -> Float:
-        from scipy.ndimage import map_coordinates
-
-        at = (places - self._low) / CELL - 0.5
-        return np.asarray(map_coordinates(values, at.T, order=1, mode="nearest"), np.float64)
+        return sample_cells(values, (places - self._low) / CELL)
 
 
 def _lit(
@@ -235,10 +236,7 @@ def lasting_shadows(
     found = np.zeros(len(points), np.bool_)
     for item in objects:
         track = item.trajectory
-        poses = [track.middle]
-        if track.moves:
-            times = np.linspace(track.start_us, track.end_us, POSES).astype(np.int64)
-            poses = [track.transform(int(t)) for t in times]
+        poses = track.spread(POSES)
         reach = float(np.hypot(*item.size[:2])) / 2 + MAX_SHADOW
         centres = np.array([T[:2, 3] for T in poses])
         low, high = centres.min(axis=0) - reach, centres.max(axis=0) + reach

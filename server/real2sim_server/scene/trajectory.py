@@ -116,6 +116,15 @@ class Trajectory:
         """``T_world_object`` [4, 4] in the middle of the time span."""
         return self.transform((self.start_us + self.end_us) // 2)
 
+    def spread(self, count: int) -> Float:
+        """``T_world_object`` [count, 4, 4] at evenly spread times; of an object that does not move
+        only the one in the middle, [1, 4, 4].
+        """
+        if not self.moves:
+            return self.middle[None]
+        times = np.linspace(self.start_us, self.end_us, count).astype(np.int64)
+        return np.stack([self.transform(int(t)) for t in times])
+
     def covers(self, t_us: int) -> bool:
         """Whether a pose is known at ``t_us``."""
         return self.start_us <= t_us <= self.end_us

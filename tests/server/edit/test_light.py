@@ -172,6 +172,14 @@ def test_an_object_at_the_edge_of_the_shade_is_half_dark(street):
     np.testing.assert_allclose(after[roof & (x > 1.2) & (x < 1.7)], before[0] / 2, atol=0.02)
 
 
+def test_scenes_with_the_same_object_shade_it_each_in_its_own_light(street):
+    car = street.objects["car"]
+    turned = transform_from([0.0, 0.0, 1.0], yaw_quaternion(np.pi))
+    in_sun, in_shade = (colours(shaded(car, turned, 0, sunny(lit))[0]) for lit in (1.0, 0.0))
+
+    assert np.abs(in_sun - in_shade).max() > 0.05
+
+
 def test_unedited_objects_and_scenes_without_sun_keep_their_colours(street):
     state = ScenarioState.of(street)
     assert instances_at(street, state, 0)[1].cloud is street.objects["car"].cloud

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -425,8 +424,7 @@ def _inpaint_objects(
                 VehicleSurface(parts.surfels.points[mine], normals, colours[mine], seen, body)
             )
             if light_map is not None:
-                lit = light_map.lit_along(track.trajectory)
-                lights.append(partial(light_map.sun.brightness, lit=lit))
+                lights.append(light_map.light_along(track.trajectory))
     filled, light, palette = fill_vehicles(surfaces, lights or None)
     for k, found in zip(closed, filled, strict=True):
         colours[members[k]] = found

@@ -40,7 +40,7 @@ FINE = np.deg2rad(np.arange(-9.0, 9.1, 3.0))
 MIN_EXPLAINED = 0.05
 """Minimum explained share of the variance; otherwise the sky counts as overcast."""
 MAX_SHADE = 0.85
-"""Maximum brightness of shadows relative to sunlit ground; see above."""
+"""Maximum brightness of shadows relative to sunlit ground; otherwise the sky counts as overcast."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -492,10 +492,12 @@ def fill_vehicles(
 ) -> tuple[list[NDArray[np.float32]], Float, NDArray[np.float32]]:
     """Colours [N, 3] of each vehicle's points, and the shared light [3] and palette [10, 3].
 
-    ``lights`` are the light on each vehicle, for normals in the world; None for the shared light.
-
     Seen colours do not change. A vehicle with almost no seen paint becomes grey, with the median
     brightness of the others.
+
+    Args:
+        surfaces: by vehicle.
+        lights: the light on each vehicle, for normals in the world; None for the shared light.
     """
     painted = [s.seen_paint() for s in surfaces]
     light = fit_light(
@@ -504,13 +506,13 @@ def fill_vehicles(
     )
     shared: list[Light] = [partial(brightness, light)] * len(surfaces)
     lit = [on(s.normals) for s, on in zip(surfaces, lights or shared, strict=True)]
-    paints = [_shown_paints(s, on) for s, on in zip(surfaces, lit, strict=True)]
+    paints = [_shown_paints(s, bright) for s, bright in zip(surfaces, lit, strict=True)]
     palette = _shown_palette(surfaces, lit)
     found = [p[Part.PAINT] for p in paints if Part.PAINT in p]
     usual = np.full(3, np.median(np.mean(found, axis=1)), np.float32) if found else GREY
     filled = [
-        _filled(s, on, with_paints(palette, mine, usual))
-        for s, on, mine in zip(surfaces, lit, paints, strict=True)
+        _filled(s, bright, with_paints(palette, mine, usual))
+        for s, bright, mine in zip(surfaces, lit, paints, strict=True)
     ]
     return filled, light, palette
 
@@ -526,9 +528,9 @@ def _shown_palette(
     surfaces: Sequence[VehicleSurface], lit: Sequence[NDArray[np.float32]]
 ) -> NDArray[np.float32]:
     parts, colours = [], []
-    for surface, on in zip(surfaces, lit, strict=True):
+    for surface, bright in zip(surfaces, lit, strict=True):
         parts.append(surface.parts(reach=ON_PART)[surface.seen])
-        colours.append((surface.colours / on)[surface.seen])
+        colours.append((surface.colours / bright)[surface.seen])
     return fit_palette(parts, colours)
 
 

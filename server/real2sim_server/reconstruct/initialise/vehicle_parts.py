@@ -77,8 +77,8 @@ def light_on(item: SceneObject, scene: Scene) -> Light:
     light_map = scene.light_map
     axes = item.trajectory.middle[:3, :3]
     if light_map is not None:
-        lit = light_map.lit_along(item.trajectory)
-        return lambda normals: light_map.sun.brightness(normals @ axes.T, lit)
+        light = light_map.light_along(item.trajectory)
+        return lambda normals: light(normals @ axes.T)
     reconstruction = scene.provenance.get("reconstruction")
     known = reconstruction.get(LIGHT) if isinstance(reconstruction, dict) else None
     slopes = np.array(FROM_ABOVE if known is None else known, dtype=np.float64)
