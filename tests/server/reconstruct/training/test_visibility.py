@@ -239,7 +239,7 @@ def test_priors_occluded_only_by_other_priors_are_not_restored(model, viewpoints
 
 
 def test_training_prunes_hidden_gaussians_at_its_rounds(tiny_log, tiny_scene):
-    densify = replace(TINY.densify, method="none", hidden_rounds=(0.05,))
+    densify = replace(TINY.densify, method="none", hidden_round=0.05)
     trainer = Trainer(tiny_log, tiny_scene, replace(TINY, densify=densify), backend="cpu")
     before = len(trainer.model.gaussians)
     trainer.run(until=2)
