@@ -118,7 +118,7 @@ MIN_CONTRAST = 0.5
 MIN_CELLS = 100
 """Minimum number of cells with ground for shade."""
 
-BRIGHTEST = 1.1
+MAX_BRIGHTNESS = 1.1
 """Maximum brightness of ground without its shadow, relative to the usual one."""
 
 LUMA = np.array([0.2126, 0.7152, 0.0722])
@@ -198,7 +198,7 @@ class LightMap:
         share = (np.clip((dark - 0.25) / 0.5, 0, 1) * self.lit(places))[:, None]
         lit = usual * ((colours / self.sun.shade) @ LUMA / (usual @ LUMA).clip(0.01))[:, None]
         # In the soft edge, only a part of the light is missing.
-        limit = np.maximum(colours, BRIGHTEST * usual)
+        limit = np.maximum(colours, MAX_BRIGHTNESS * usual)
         return np.asarray(np.minimum(colours * (1 - share) + lit * share, limit))
 
     def _at(self, values: NDArray[np.float32], places: Float) -> Float:

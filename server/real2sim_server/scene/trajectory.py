@@ -117,8 +117,9 @@ class Trajectory:
         return self.transform((self.start_us + self.end_us) // 2)
 
     def spread(self, count: int) -> Float:
-        """``T_world_object`` [count, 4, 4] at evenly spread times; of an object that does not move
-        only the one in the middle, [1, 4, 4].
+        """``T_world_object`` [count, 4, 4] at evenly spaced times.
+
+        A trajectory that stands still has only the pose in the middle, [1, 4, 4].
         """
         if not self.moves:
             return self.middle[None]

@@ -373,7 +373,8 @@ class DensifyOptions:
         growth: for ``mcmc``, relative growth of the number per round.
         hidden_round: fraction of all iterations at which hidden Gaussians are pruned; 0 for never.
         prior_round: fraction of all iterations at which they are pruned again and replaced by
-            priors of stage 0; the surfaces in front close up in the remaining iterations.
+            priors of stage 0, 0 for never; the surfaces in front close up in the remaining
+            iterations.
         background_limits: limits of hidden Gaussians in the background.
         object_limits: limits of hidden Gaussians in objects.
         last_background_limits: additional limits in the prior round, for background no higher than

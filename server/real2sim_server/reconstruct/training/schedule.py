@@ -201,7 +201,7 @@ PRESETS: dict[str, TrainOptions] = {
             object_voxel=0.05,
             sky_resolution=128,
         ),
-        # Few steps need large ones: 1 dB more at 1,200 iterations and 0.5 dB at 3,000.
+        # The default rates are for 30,000 iterations; fewer steps have to be larger.
         learning_rates=LearningRates(
             means=(3.2e-3, 1.6e-4), scales=0.02, quats=0.01, colour=0.01, fourier=5e-3
         ),
