@@ -17,7 +17,7 @@ from real2sim_proto.drive import Lamp
 from ..geometry import Float, invert_transform
 from ..scene import UNSEEN, GaussianCloud, Scene
 from ..scene.cloud import SH_C0
-from ..scene.coverage import LOW, MARGIN
+from ..scene.coverage import LOW, MARGIN, SEEN
 from ..scene.ground_fit import Size, cell_means, pull_push, sample_cells
 from ..scene.sunlight import LightMap, lasting_shadows
 from .light import Colour, Recent
@@ -31,8 +31,11 @@ tracks of stationary objects vary by some decimetres.
 AWAY = 0.5
 """An object at least this far from its parked position uncovers the ground there [m]."""
 
+HIDDEN = 3.0
+"""Ground that no image shows is continued up to this far from the box [m]."""
+
 RIM = 1.2
-"""Width of the ground around the box that represents the ground under it [m]."""
+"""Width of the ground around, from which it is continued [m]."""
 
 CELL = 0.08
 """Edge of the cells from which the ground is continued [m]."""
@@ -123,11 +126,12 @@ def inpaint_ground(scene: Scene, background: GaussianCloud, left: Iterable[str])
         height = local[:, 2] + half[2]
         level = height.abs() <= LOW
         opacities[(beyond <= 0) & (height > LOW) & (local[:, 2] <= half[2])] = 0.0
-        around = level & (beyond > MARGIN) & (beyond <= RIM) & (opacities > 0.1)
-        beneath = level & (beyond <= MARGIN)
-        _continue_ground(sh, local[:, :2], beneath, around, half[:2] + MARGIN)
+        # Those below the ground show through it.
+        unknown = (height <= LOW) & (height > -half[2]) & (beyond <= MARGIN)
         if uncertainties is not None:
-            uncertainties[beneath] = UNSEEN
+            unknown |= level & (beyond <= HIDDEN) & (uncertainties >= SEEN)
+            uncertainties[unknown] = UNSEEN
+        _continue_ground(sh, local[:, :2], unknown, level & ~unknown & (opacities > 0.1))
     return replace(background, opacities=opacities, sh=sh, uncertainties=uncertainties)
 
 
@@ -152,48 +156,51 @@ def _relight(sh: Tensor, rows: Tensor, places: Float, light_map: LightMap) -> No
     sh[rows, 0] = (lit - 0.5) / SH_C0
 
 
-def _continue_ground(
-    sh: Tensor, places: Tensor, unknown: Tensor, known: Tensor, half: Tensor
-) -> None:
-    """Set ``sh`` of the ``unknown`` [N] bool from the ``known`` around a rectangle, in place.
+def _continue_ground(sh: Tensor, places: Tensor, unknown: Tensor, known: Tensor) -> None:
+    """Set ``sh`` of the ``unknown`` [N] bool from the ``known`` around them, in place.
 
-    Opposite sides are joined by straight lines along the axis on which they look more alike, so
-    that kerbs and markings go on. What still differs at the border fades inwards; it makes nothing
-    brighter than 95 % of the ground around.
+    Opposite sides of the rectangle around the unknown ones are joined by straight lines along the
+    axis on which they look more alike, so that kerbs and markings go on. What still differs at the
+    border fades inwards; it makes nothing brighter than 95 % of the ground around.
 
     Args:
         sh: [N, K, 3].
         places: [N, 2] in the frame of the rectangle [m].
-        unknown: Gaussians in the rectangle.
-        known: Gaussians around it.
-        half: [2], half of the sides of the rectangle [m].
+        unknown: Gaussians without a colour.
+        known: Gaussians with one; only those up to RIM around the unknown ones count.
     """
-    if int(known.sum()) < MIN_POINTS or not bool(unknown.any()):
+    if not bool(unknown.any()):
         return
-    sides = half.cpu().double().numpy()
-    low = -sides - RIM
-    rows, columns = np.ceil(-2 * low / CELL).astype(int)
+    low, high = places[unknown].amin(dim=0) - RIM, places[unknown].amax(dim=0) + RIM
+    known = known & ((places >= low) & (places <= high)).all(dim=1)
+    if int(known.sum()) < MIN_POINTS:
+        return
+    corner, size = (v.cpu().double().numpy() for v in (low, high - low))
+    rows, columns = np.ceil(size / CELL).astype(int)
     shape = int(rows), int(columns)
-    at = np.floor((places[known].cpu().double().numpy() - low) / CELL).astype(int)
+    at = np.floor((places[known].cpu().double().numpy() - corner) / CELL).astype(int)
     cells = np.ravel_multi_index(at.clip(0, np.array(shape) - 1).T, shape)
     colours = (sh[known, 0] * SH_C0 + 0.5).clamp(0, 1).cpu().double().numpy()
     mean, counts = cell_means(colours, cells, shape)
-    joined = [_join(mean, counts > 0, axis, sides[axis]) for axis in (0, 1)]
+    joined = [_join(mean, counts > 0, axis) for axis in (0, 1)]
     lines, _ = min(joined, key=lambda pair: pair[1])
     rest = np.where((counts > 0)[..., None], mean - lines, 0).astype(np.float32)
     guess = lines + pull_push(rest, np.minimum(counts, 1).astype(np.float32))
     guess = np.minimum(guess, np.maximum(lines, np.quantile(colours, 0.95, axis=0)))
-    colour = sample_cells(guess, (places[unknown].cpu().double().numpy() - low) / CELL)
+    colour = sample_cells(guess, (places[unknown].cpu().double().numpy() - corner) / CELL)
     sh[unknown] = 0
     sh[unknown, 0] = torch.from_numpy((colour - 0.5) / SH_C0).to(sh)
 
 
-def _join(mean: Float, known: NDArray[np.bool_], axis: int, half: float) -> tuple[Float, float]:
-    """Colours [X, Y, 3] joined between both ends of an axis, and how much the ends differ."""
+def _join(mean: Float, known: NDArray[np.bool_], axis: int) -> tuple[Float, float]:
+    """Colours [X, Y, 3] joined between both ends of an axis, which are RIM wide, and how much the
+    ends differ.
+    """
     mean, known = np.moveaxis(mean, axis, 0), np.moveaxis(known, axis, 0)
-    along = (np.arange(len(mean)) + 0.5) * CELL - half - RIM
+    along = (np.arange(len(mean)) + 0.5) * CELL
+    length = len(mean) * CELL
     ends = []
-    for end in (along < -half, along > half):
+    for end in (along < RIM, along > length - RIM):
         seen = np.where(known[end][..., None], mean[end], np.nan)
         enough = known[end].sum(axis=0) >= MIN_CELLS
         seen[:, ~enough] = 0
@@ -202,7 +209,7 @@ def _join(mean: Float, known: NDArray[np.bool_], axis: int, half: float) -> tupl
         ends.append((filled, enough))
     (first, a), (last, b) = ends
     first, last = (first if a.any() else last), (last if b.any() else first)
-    share = np.clip((along + half) / (2 * half), 0, 1)[:, None, None]
+    share = np.clip((along - RIM) / max(length - 2 * RIM, CELL), 0, 1)[:, None, None]
     joined = np.moveaxis(first * (1 - share) + last * share, 0, axis)
     both = a & b
     differ = float(np.abs(first - last)[both].mean()) if both.any() else np.inf

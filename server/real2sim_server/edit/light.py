@@ -31,7 +31,7 @@ from ..render.types import Instance
 from ..scene import GaussianCloud, Ground, Scene, SceneObject, Sunlight, TimeColour
 from ..scene.cloud import SH_C0
 from ..scene.ground_fit import Size
-from ..scene.sunlight import LUMA, LightMap
+from ..scene.sunlight import LUMA, LightMap, relight
 
 Colour = tuple[float, float, float]
 
@@ -270,8 +270,11 @@ PLACE = 0.25
 POSES = 8
 """Number of recorded poses for the mean light of an object."""
 
-SHADING_RANGE = (0.33, 3.0)
-"""Limits of the change of brightness."""
+SHADING_RANGE = (0.1, 10.0)
+"""Limits of the change of light."""
+
+DARKEST = 0.02
+"""Colours darker than this change like this one."""
 
 
 _shadings: Recent[GaussianCloud, tuple[GaussianCloud, TimeColour | None]] = Recent(KEPT_SHADINGS)
@@ -312,9 +315,11 @@ def shaded(
             varies = (colour.coefficients != 0).flatten(1).any(1).cpu().numpy()
             was = np.where(varies, lit(recorded), was)
         sun = light_map.sun
-        before = sun.brightness(normals @ recorded[:3, :3].T, was)
-        after = sun.brightness(normals @ T_world_object[:3, :3].T, lit(T_world_object))
-        gain = torch.from_numpy(np.clip(after / before, *SHADING_RANGE)).to(cloud.sh)
+        before = sun.on(normals @ recorded[:3, :3].T, was)
+        after = sun.on(normals @ T_world_object[:3, :3].T, lit(T_world_object))
+        shown = (cloud.sh[:, 0].cpu().numpy() * SH_C0 + 0.5).clip(DARKEST, 1)
+        factors = relight(shown, np.clip(after / before, *SHADING_RANGE)) / shown
+        gain = torch.from_numpy(factors).to(cloud.sh)
         if colour is None:
             return relit(cloud, gain), None
         return relit(cloud, gain), replace(colour, coefficients=colour.coefficients * gain[:, None])

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,8 +51,8 @@ class Sunlight:
         halves = (np.array(size) / 2 + margin)[None]
         return boxes_hit(points, self.towards, invert_transform(T_world_box)[None], halves)
 
-    def brightness(self, normals: Float, lit: Float | float) -> NDArray[np.float32]:
-        """Brightness [N, 3] of surfaces, 1 on sunlit level ground, as display values.
+    def on(self, normals: Float, lit: Float | float) -> NDArray[np.float32]:
+        """Light [N, 3] on surfaces, 1 on sunlit level ground; see :func:`relight`.
 
         In the shade, surfaces that face up have the hue of the sky. The others also get light that
         the ground reflects, which is white.
@@ -69,7 +70,30 @@ class Sunlight:
         hue = (shade / grey) ** (0.5 + 0.5 * up)
         direct = np.reshape(lit, (-1, 1)) * facing * (1 - shade)
         light = (SIDE_LIGHT + (1 - SIDE_LIGHT) * up) * grey * hue + direct
-        return np.asarray(light ** (1 / DISPLAY), np.float32)
+        return np.asarray(light, np.float32)
+
+
+def light_of(colours: NDArray[Any]) -> NDArray[Any]:
+    """Light [N, 3] that display values [N, 3] show, 1 for white; below 0 counts as 0.
+
+    Cameras compress bright light (Reinhard et al. 2002).
+    """
+    power = np.clip(colours, 0, MAX_PAINT) ** DISPLAY
+    return np.asarray(power / (1 + SHOULDER * (1 - power)))
+
+
+def relight(colours: NDArray[Any], gain: NDArray[Any] | float) -> NDArray[np.float32]:
+    """Display values of ``colours`` [N, 3] in ``gain`` times the light.
+
+    A white car changes less than a dark one. Values of paint in full light can be above 1.
+
+    Args:
+        colours: [N, 3] display values; below 0 counts as 0.
+        gain: factor on the light, for all, [N, 1] or [N, 3].
+    """
+    light = gain * light_of(colours)
+    power = (1 + SHOULDER) * light / (1 + SHOULDER * light)
+    return np.asarray(power ** (1 / DISPLAY), np.float32)
 
 
 def boxes_hit(points: Float, rays: Float, boxes: Float, halves: Float) -> NDArray[np.bool_]:
@@ -126,6 +150,12 @@ LUMA = np.array([0.2126, 0.7152, 0.0722])
 DISPLAY = 2.2
 """Exponent from display values to light."""
 
+SHOULDER = 0.5
+"""How strongly cameras compress bright light; 0 for not at all."""
+
+MAX_PAINT = 1.5
+"""Maximum display value of paint in full light."""
+
 MIN_SHADE = 0.4
 """Minimum brightness of upward surfaces in the shade, relative to the sun."""
 
@@ -181,11 +211,11 @@ class LightMap:
         return self.lit(points[:, :2] - heights[:, None] * along)
 
     def light_along(self, trajectory: Trajectory) -> Callable[[Float], NDArray[np.float32]]:
-        """Brightness [N, 3] of surfaces of an object, in its mean light, by their normals [N, 3] in
-        the world; see :meth:`Sunlight.brightness`.
+        """Light [N, 3] on surfaces of an object, the mean over its path, by their normals [N, 3] in
+        the world; see :meth:`Sunlight.on`.
         """
         lit = float(self.lit(trajectory.positions[:, :2]).mean())
-        return partial(self.sun.brightness, lit=lit)
+        return partial(self.sun.on, lit=lit)
 
     def without_shadow(self, colours: Float, places: Float) -> Float:
         """Colours [N, 3] of ground at ``places`` [N, 2] in the shadow of an object, without it.

@@ -97,17 +97,21 @@ def test_inpainted_ground_counts_as_never_seen(tiny_scene):
     assert float(clean.uncertainties.min()) == pytest.approx(0.02)
 
 
-def test_a_line_beside_the_kerb_goes_on_below_a_removed_object(tiny_scene):
+@pytest.mark.parametrize("behind", [0.25, 2.0])
+def test_a_line_beside_the_kerb_goes_on_below_and_behind_a_removed_object(tiny_scene, behind):
     parked = tiny_scene.object(PARKED)
     centre = parked.trajectory.transform(tiny_scene.start_us)[:3, 3]
     half = np.array(parked.size) / 2
-    across = np.linspace(-3, 3, 101)
+    across = np.linspace(-4, 4, 135)
     plane = np.stack(np.meshgrid(across, across, indexing="ij"), axis=-1).reshape(-1, 2)
     # A pavement beyond y = 0, and a white line at the middle of its edge.
     stripes = np.where(np.abs(plane[:, 1]) < 0.09, 0.8, np.where(plane[:, 1] > 0, 0.6, 0.4))
-    hidden = (np.abs(plane) <= half[:2] + 0.25).all(axis=1)
+    hidden = (plane >= -half[:2] - 0.25).all(axis=1)
+    hidden &= (plane <= half[:2] + np.array([0.25, behind])).all(axis=1)
     shown = np.where(hidden, 0.05, stripes)
-    means = np.column_stack([plane, np.full(len(plane), -half[2])]) + centre
+    # Some below the object are too deep: they would show through the ground.
+    deep = np.where((np.abs(plane) < half[:2]).all(axis=1) & (plane[:, 0] > 0), 0.3, 0)
+    means = np.column_stack([plane, -half[2] - deep]) + centre
     count = len(means)
     ground = GaussianCloud(
         means=torch.from_numpy(means).float(),
@@ -115,6 +119,7 @@ def test_a_line_beside_the_kerb_goes_on_below_a_removed_object(tiny_scene):
         scales=torch.full((count, 3), 0.05),
         opacities=torch.ones(count),
         sh=torch.from_numpy((shown - 0.5) / SH_C0).float()[:, None, None].repeat(1, 1, 3),
+        uncertainties=torch.from_numpy(np.where(hidden, UNSEEN, 0.02)).float(),
     )
 
     clean = inpaint_ground(tiny_scene, ground, (PARKED,))

@@ -11,7 +11,7 @@ from real2sim_server.geometry import transform_from
 from real2sim_server.scene import Sunlight, Trajectory
 from real2sim_server.scene.errors import SceneError
 from real2sim_server.scene.io import load_scene, read_packed, save_scene, write_packed
-from real2sim_server.scene.sunlight import LightMap, lasting_shadows
+from real2sim_server.scene.sunlight import LightMap, lasting_shadows, relight
 
 SHADE = np.array([0.5, 0.55, 0.6])
 SUN = Sunlight(np.array([-0.6, 0.0, 0.8]), SHADE)
@@ -102,22 +102,34 @@ def test_ground_in_the_soft_edge_of_a_shadow_becomes_no_brighter_than_around(dar
     assert 0.4 < clear.min() <= clear.max() <= 0.55 + 1e-6
 
 
-def test_level_ground_has_brightness_one_in_the_sun_and_that_of_shadows_in_the_shade():
+def test_level_ground_has_light_one_in_the_sun_and_that_of_shadows_in_the_shade():
     sunny = ground(lambda places: np.full(len(places), 0.5))
-    up = np.array([[0.0, 0, 1]])
+    up, dark = np.array([[0.0, 0, 1]]), np.full((1, 3), 0.1)
 
-    np.testing.assert_allclose(sunny.sun.brightness(up, 1.0), [[1.0] * 3], atol=1e-6)
-    np.testing.assert_allclose(sunny.sun.brightness(up, 0.0), [SHADE], atol=1e-6)
+    np.testing.assert_allclose(sunny.sun.on(up, 1.0), [[1.0] * 3], atol=1e-6)
+    shade = relight(dark, sunny.sun.on(up, 0.0))
+    np.testing.assert_allclose(shade, dark * SHADE, atol=1e-3)
+
+
+def test_bright_colours_change_less_than_dark_ones_when_the_light_does():
+    colours = np.array([[0.1] * 3, [0.5] * 3, [0.9] * 3])
+
+    brighter, darker = relight(colours, 2.0), relight(colours, 0.5)
+
+    assert (np.diff((brighter / colours)[:, 0]) < -0.02).all()
+    assert (np.diff((darker / colours)[:, 0]) > 0.01).all()
+    np.testing.assert_allclose(relight(colours, 1.0), colours, atol=1e-6)
+    np.testing.assert_allclose(relight(brighter, 0.5), colours, atol=1e-6)
 
 
 def test_the_side_towards_the_sun_is_brighter_only_in_the_sun():
     sunny = ground(lambda places: np.full(len(places), 0.5))
     sides = np.array([[-1.0, 0, 0], [1.0, 0, 0]])
 
-    towards, away = sunny.sun.brightness(sides, 1.0)
-    shaded = sunny.sun.brightness(sides, 0.0)
+    towards, away = sunny.sun.on(sides, 1.0)
+    shaded = sunny.sun.on(sides, 0.0)
 
-    assert (towards > 1.2 * away).all()
+    assert (towards > 1.5 * away).all()
     np.testing.assert_allclose(shaded[0], shaded[1])
 
 

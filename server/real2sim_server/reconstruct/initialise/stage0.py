@@ -98,6 +98,11 @@ class _SurfelSet:
     walls: slice
     bodies: tuple[VehicleBody | None, ...] = ()
 
+    def objects(self, count: int) -> list[NDArray[np.int64]]:
+        """Indices [N] of the Gaussians of each of the ``count`` objects, without its underside."""
+        bodies = ~self.is_underside
+        return [np.flatnonzero((self.instance == i + 1) & bodies) for i in range(count)]
+
     def without(self, dropped: NDArray[np.int64]) -> _SurfelSet:
         """Remove the walls at these indices."""
         kept = np.ones(len(self.surfels), dtype=np.bool_)
@@ -174,7 +179,8 @@ def initialise_scene(
     with stages("colour") as report_step:
         colours, known, sky_samples = _sample_colours(log, parts, options, report_step)
     with stages("sunlight"):
-        sunlight = fit_sunlight(log, fitted.ground)
+        shapes = [parts.surfels.points[mine] for mine in parts.objects(len(log.tracks))]
+        sunlight = fit_sunlight(log, fitted.ground, shapes)
     with stages("fill"):
         colours, look = _inpaint(log, parts, fitted.surface, colours, known, sunlight=sunlight)
         sky = sky_samples.finish(_median_colour(colours[: parts.ground_count]))
@@ -397,8 +403,7 @@ def _inpaint_objects(
 
     Returns the shared values of vehicles.
     """
-    bodies = ~parts.is_underside
-    members = [np.flatnonzero((parts.instance == i + 1) & bodies) for i in range(len(log.tracks))]
+    members = parts.objects(len(log.tracks))
     if not members:
         return colours, {}
     relative = np.zeros(len(colours), dtype=np.float32)

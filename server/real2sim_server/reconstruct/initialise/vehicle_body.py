@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ...geometry import Float, invert_transform
 from ...logs import DrivingLog, ObjectTrack
 from ...scene import Scene
+from ...scene.sunlight import relight
 from ...synthetic.materials import BODY, PLAIN, WHEEL
 from ...synthetic.vehicles import CARGO_FLOOR, SHAPES, VehicleShape, build_vehicle
 from .accumulate import PointSet
@@ -175,10 +176,10 @@ def body_colours(
     lit = light(body.unit_normals())
     # Points far from the body belong to the dark plate under it.
     near = distance < PAINT_REACH
-    plain = colours / lit[nearest]
+    plain = relight(colours, 1 / lit[nearest])
     usual = modal_colour(plain) if len(plain) else GREY
     own = with_paints(palette, shown_paints(body.parts[nearest[near]], plain[near]), usual)
-    return np.asarray(np.clip(body.colours(own) * lit, 0, 1), dtype=np.float32)
+    return np.clip(relight(body.colours(own), lit), 0, 1)
 
 
 def faced(
@@ -450,6 +451,9 @@ def _face(half: Float, axis: int, sign: int, spacing: float) -> Float:
 #
 # Shading is removed first and applied again for the direction of the unseen side.
 
+UPRIGHT = 0.3
+"""Maximum vertical component of the normals of surfaces that face the horizon."""
+
 ON_PART = 0.06
 """Maximum distance of points with the colour of the body's part [m]. Others are behind glass.
 """
@@ -521,25 +525,27 @@ def _shown_paints(
     surface: VehicleSurface, lit: NDArray[np.float32]
 ) -> dict[Part, NDArray[np.float32]]:
     seen = surface.seen
-    return shown_paints(surface.parts()[seen], (surface.colours / lit)[seen])
+    return shown_paints(surface.parts()[seen], relight(surface.colours, 1 / lit)[seen])
 
 
 def _shown_palette(
     surfaces: Sequence[VehicleSurface], lit: Sequence[NDArray[np.float32]]
 ) -> NDArray[np.float32]:
-    parts, colours = [], []
+    parts, colours, upright = [], [], []
     for surface, bright in zip(surfaces, lit, strict=True):
         parts.append(surface.parts(reach=ON_PART)[surface.seen])
-        colours.append((surface.colours / bright)[surface.seen])
-    return fit_palette(parts, colours)
+        colours.append(relight(surface.colours, 1 / bright)[surface.seen])
+        upright.append(bright[np.abs(surface.normals[:, 2]) < UPRIGHT].ravel())
+    usual = np.concatenate(upright) if upright else np.ones(0)
+    return fit_palette(parts, colours, float(np.median(usual)) if len(usual) else 1.0)
 
 
 def _filled(
     surface: VehicleSurface, lit: NDArray[np.float32], palette: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    mirrored, known = fill_from_mirror(surface.points, surface.colours / lit, surface.seen)
+    plain = relight(surface.colours, 1 / lit)
+    mirrored, known = fill_from_mirror(surface.points, plain, surface.seen)
     own = surface.body.colours(palette)[surface.closest[1]]
     plain = np.where((surface.parts() != Part.PAINT)[:, None], own, palette[Part.PAINT])
-    filled = np.where(known[:, None], mirrored, plain) * lit
-    filled = np.where(surface.seen[:, None], surface.colours, filled)
-    return np.clip(filled, 0, 1).astype(np.float32)
+    filled = relight(np.where(known[:, None], mirrored, plain), lit)
+    return np.where(surface.seen[:, None], surface.colours, filled).clip(0, 1)

@@ -10,12 +10,13 @@ from numpy.typing import NDArray
 
 from ...geometry import Float
 from ...scene import Scene, SceneObject
+from ...scene.sunlight import DISPLAY, light_of, relight
 from ...synthetic.vehicles import VehicleShape, roof_heights
 from .surfels import MIN_OBSERVED, modal_colour
 
 Colours = NDArray[np.float32]
 Light = Callable[[Float], Colours]
-"""Brightness [N, 1] or [N, 3] of paint on surfaces with unit normals [N, 3]."""
+"""Light [N, 1] or [N, 3] on surfaces with unit normals [N, 3], see :func:`.sunlight.relight`."""
 
 # Shading: paint is brighter where it faces the sun and the sky.
 #
@@ -50,8 +51,8 @@ def fit_light(normals: Sequence[Float], colours: Sequence[NDArray[np.float32]]) 
         return prior
     owner = np.repeat(np.arange(len(members)), [len(normals[k]) for k in members])
     unit = np.concatenate([normals[k] for k in members])
-    bright = np.concatenate([colours[k].mean(axis=1) for k in members])
-    rest = np.log(bright.clip(DARKEST)) - unit @ prior
+    bright = np.concatenate([light_of(colours[k]).mean(axis=1) for k in members])
+    rest = np.log((bright ** (1 / DISPLAY)).clip(DARKEST)) - unit @ prior
     share = np.concatenate([np.full(len(normals[k]), 1 / len(normals[k])) for k in members])
     # The paint of each vehicle is unknown.
     columns = np.concatenate([unit, np.eye(len(members))[owner]], axis=1)
@@ -65,8 +66,8 @@ def fit_light(normals: Sequence[Float], colours: Sequence[NDArray[np.float32]]) 
 
 
 def brightness(light: Float, normals: Float) -> NDArray[np.float32]:
-    """Brightness [N, 1] of paint on surfaces with unit ``normals`` [N, 3], 1 on average."""
-    return np.exp(normals @ light)[:, None].astype(np.float32)
+    """Light [N, 1] on surfaces with unit ``normals`` [N, 3], 1 on average."""
+    return np.exp(DISPLAY * (normals @ light))[:, None].astype(np.float32)
 
 
 def light_on(item: SceneObject, scene: Scene) -> Light:
@@ -148,15 +149,16 @@ def default_palette() -> Colours:
 
 
 def fit_palette(
-    parts: Sequence[NDArray[np.uint8]], colours: Sequence[NDArray[np.float32]]
+    parts: Sequence[NDArray[np.uint8]], colours: Sequence[NDArray[np.float32]], light: float = 1.0
 ) -> Colours:
     """Colours [10, 3] by part, with FITTED parts as observed on the vehicles of a log.
 
     Args:
         parts: per vehicle, [N] parts of the seen points.
         colours: per vehicle, [N, 3] of these points, without the light.
+        light: usual light on surfaces that face the horizon.
     """
-    palette = default_palette()
+    palette = relight(default_palette(), 1 / light)
     for part in FITTED:
         members = [c[p == part] for p, c in zip(parts, colours, strict=True)]
         shown = [modal_colour(c) for c in members if len(c) >= MIN_OBSERVED]

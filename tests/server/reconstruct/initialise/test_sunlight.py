@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from real2sim_server.reconstruct.initialise.sunlight import fit_sunlight
+from real2sim_server.reconstruct.initialise.vehicle_body import fitted_body
 from real2sim_server.scene import Ground
 from real2sim_server.synthetic import SyntheticConfig, generate_log
 from real2sim_server.synthetic.sensors import SUN
@@ -28,10 +29,16 @@ def ground():
     )
 
 
-def test_shadows_of_moving_vehicles_give_the_sun(street, ground):
-    found = fit_sunlight(street, ground)
+def shapes(log) -> list[np.ndarray]:
+    nothing = np.zeros((0, 3), np.float32)
+    bodies = [fitted_body(nothing, track.size, track.category) for track in log.tracks]
+    return [nothing if body is None else body.points.astype(np.float32) for body in bodies]
 
-    assert found.towards @ SUN / np.linalg.norm(SUN) > np.cos(np.deg2rad(12))
+
+def test_shadows_of_moving_vehicles_give_the_sun(street, ground):
+    found = fit_sunlight(street, ground, shapes(street))
+
+    assert found.towards @ SUN / np.linalg.norm(SUN) > np.cos(np.deg2rad(4))
     assert (found.shade > 0.35).all()
     assert (found.shade < 0.75).all()
     # Shadows are blue: they get the light of the sky.
@@ -41,8 +48,9 @@ def test_shadows_of_moving_vehicles_give_the_sun(street, ground):
 def test_a_log_without_moving_vehicles_has_no_sun(street, ground):
     parked = tuple(track for track in street.tracks if not track.trajectory.moves)
 
-    assert fit_sunlight(replace(street, tracks=parked), ground) is None
-    assert fit_sunlight(replace(street, tracks=()), ground) is None
+    for tracks in (parked, ()):
+        still = replace(street, tracks=tracks)
+        assert fit_sunlight(still, ground, shapes(still)) is None
 
 
 def test_an_overcast_log_has_no_sun(street, ground):
@@ -51,4 +59,5 @@ def test_an_overcast_log_has_no_sun(street, ground):
             rng = np.random.default_rng(frame)
             return rng.integers(90, 130, (160, 240, 3)).astype(np.uint8)
 
-    assert fit_sunlight(replace(street, source=Flat()), ground) is None
+    overcast = replace(street, source=Flat())
+    assert fit_sunlight(overcast, ground, shapes(overcast)) is None
