@@ -31,11 +31,20 @@ tracks of stationary objects vary by some decimetres.
 AWAY = 0.5
 """An object at least this far from its parked position uncovers the ground there [m]."""
 
+TURNED = math.cos(math.radians(10))
+"""Maximum cosine between the heading of a turned object and that of the parked one."""
+
 HIDDEN = 3.0
 """Ground that no image shows is continued up to this far from the box [m]."""
 
+SQUARE = 0.3
+"""Ground is hidden in squares of this size in which nothing was seen [m]."""
+
 RIM = 1.2
 """Width of the ground around, from which it is continued [m]."""
+
+FADING = 0.3
+"""Distance in which differences from the continued lines fade [m]."""
 
 CELL = 0.08
 """Edge of the cells from which the ground is continued [m]."""
@@ -114,8 +123,9 @@ def inpaint_ground(scene: Scene, background: GaussianCloud, left: Iterable[str])
         UnknownObjectError: ``scene`` has no such object.
     """
     opacities, sh = background.opacities.clone(), background.sh.clone()
-    known = background.uncertainties
-    uncertainties = None if known is None else known.clone()
+    uncertainties = background.uncertainties
+    if uncertainties is not None:
+        uncertainties = uncertainties.clone()
     for object_id in left:
         parked = scene.object(object_id)
         T_world_box = parked.trajectory.middle
@@ -128,10 +138,12 @@ def inpaint_ground(scene: Scene, background: GaussianCloud, left: Iterable[str])
         opacities[(beyond <= 0) & (height > LOW) & (local[:, 2] <= half[2])] = 0.0
         # Those below the ground show through it.
         unknown = (height <= LOW) & (height > -half[2]) & (beyond <= MARGIN)
+        known = level & ~unknown & (opacities > 0.1)
         if uncertainties is not None:
-            unknown |= level & (beyond <= HIDDEN) & (uncertainties >= SEEN)
+            near = level & (beyond <= HIDDEN)
+            unknown[near] |= _hidden(local[near, :2], (known & (uncertainties < SEEN))[near])
             uncertainties[unknown] = UNSEEN
-        _continue_ground(sh, local[:, :2], unknown, level & ~unknown & (opacities > 0.1))
+        _continue_ground(sh, local[:, :2], unknown, known & ~unknown)
     return replace(background, opacities=opacities, sh=sh, uncertainties=uncertainties)
 
 
@@ -144,7 +156,8 @@ def _parked(recorded: ObjectState) -> bool:
 def _away(pose: Float, parked: ObjectState) -> bool:
     (low_x, low_y), (high_x, high_y) = parked.bounds[:, :2].tolist()
     x, y = float(pose[0, 3]), float(pose[1, 3])
-    return math.hypot(x - (low_x + high_x) / 2, y - (low_y + high_y) / 2) > AWAY
+    away = math.hypot(x - (low_x + high_x) / 2, y - (low_y + high_y) / 2) > AWAY
+    return away or float(pose[:3, 0] @ parked.trajectory.middle[:3, 0]) < TURNED
 
 
 def _relight(sh: Tensor, rows: Tensor, places: Float, light_map: LightMap) -> None:
@@ -154,6 +167,19 @@ def _relight(sh: Tensor, rows: Tensor, places: Float, light_map: LightMap) -> No
     gain = lit / (sh[rows, 0] * SH_C0 + 0.5).clamp(min=0.01)
     sh[rows] = sh[rows] * gain[:, None]
     sh[rows, 0] = (lit - 0.5) / SH_C0
+
+
+def _hidden(places: Tensor, seen: Tensor) -> Tensor:
+    """[N] bool, ``places`` [N, 2] that are not ``seen`` [N], in or next to a square without seen
+    ones. Single unseen Gaussians between seen ones do not count.
+    """
+    if not len(places):
+        return seen
+    row, column = ((places - places.amin(dim=0)) / SQUARE).long().T
+    count = torch.zeros(int(row.max()) + 1, int(column.max()) + 1).to(places)
+    count.index_put_((row, column), seen.to(places), accumulate=True)
+    near = torch.nn.functional.max_pool2d((count == 0).to(places)[None], 3, 1, 1)[0] > 0
+    return ~seen & near[row, column]
 
 
 def _continue_ground(sh: Tensor, places: Tensor, unknown: Tensor, known: Tensor) -> None:
@@ -169,6 +195,8 @@ def _continue_ground(sh: Tensor, places: Tensor, unknown: Tensor, known: Tensor)
         unknown: Gaussians without a colour.
         known: Gaussians with one; only those up to RIM around the unknown ones count.
     """
+    import cv2
+
     if not bool(unknown.any()):
         return
     low, high = places[unknown].amin(dim=0) - RIM, places[unknown].amax(dim=0) + RIM
@@ -185,7 +213,9 @@ def _continue_ground(sh: Tensor, places: Tensor, unknown: Tensor, known: Tensor)
     joined = [_join(mean, counts > 0, axis) for axis in (0, 1)]
     lines, _ = min(joined, key=lambda pair: pair[1])
     rest = np.where((counts > 0)[..., None], mean - lines, 0).astype(np.float32)
-    guess = lines + pull_push(rest, np.minimum(counts, 1).astype(np.float32))
+    away = cv2.distanceTransform((counts == 0).astype(np.uint8), cv2.DIST_L2, 5)[..., None] * CELL
+    fading = np.exp(-away / FADING)
+    guess = lines + fading * pull_push(rest, np.minimum(counts, 1).astype(np.float32))
     guess = np.minimum(guess, np.maximum(lines, np.quantile(colours, 0.95, axis=0)))
     colour = sample_cells(guess, (places[unknown].cpu().double().numpy() - corner) / CELL)
     sh[unknown] = 0

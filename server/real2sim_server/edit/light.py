@@ -267,8 +267,8 @@ NEIGHBOURS = 24
 PLACE = 0.25
 """Shadings are cached for positions in these steps [m]."""
 
-POSES = 8
-"""Number of recorded poses for the mean light of an object."""
+POSES = 16
+"""Number of recorded poses that give the light in which an object was seen."""
 
 SHADING_RANGE = (0.1, 10.0)
 """Limits of the change of light."""
@@ -306,24 +306,30 @@ def shaded(
             return light_map.lit_above(apply_transform(pose, points), points[:, 2] + height)
 
         def surface() -> tuple[Float, Float]:
-            """Normals, and the mean share of the sun over the recording."""
-            return _outward(cloud), np.mean([lit(pose) for pose in track.spread(POSES)], axis=0)
+            """Normals, and the share [POSES, N] of the sun over the recording."""
+            return _outward(cloud), np.array([lit(track.transform(t)) for t in times])
 
-        normals, was = _surfaces.get(cloud, light_map, surface)
-        if colour is not None:
-            # Sides that no image shows have the mean light at all times.
-            varies = (colour.coefficients != 0).flatten(1).any(1).cpu().numpy()
-            was = np.where(varies, lit(recorded), was)
+        times = np.linspace(track.start_us, track.end_us, POSES).astype(np.int64)
+        normals, shares = _surfaces.get(cloud, light_map, surface)
+        was = shares.mean(axis=0)
+        if varies is not None:
+            # The colours follow the light as far as their few basis functions can. Sides that no
+            # image shows have the mean light at all times.
+            moving = (varies.coefficients != 0).flatten(1).any(1).cpu().numpy()
+            weights = (1 + 2 * varies.tones_of(times) @ varies.tones(t_us).numpy()) / POSES
+            was[moving] = (weights @ shares[:, moving] / weights.sum()).clip(0, 1)
         sun = light_map.sun
         before = sun.on(normals @ recorded[:3, :3].T, was)
         after = sun.on(normals @ T_world_object[:3, :3].T, lit(T_world_object))
         shown = (cloud.sh[:, 0].cpu().numpy() * SH_C0 + 0.5).clip(DARKEST, 1)
         factors = relight(shown, np.clip(after / before, *SHADING_RANGE)) / shown
         gain = torch.from_numpy(factors).to(cloud.sh)
-        if colour is None:
+        if varies is None:
             return relit(cloud, gain), None
-        return relit(cloud, gain), replace(colour, coefficients=colour.coefficients * gain[:, None])
+        return relit(cloud, gain), replace(varies, coefficients=varies.coefficients * gain[:, None])
 
+    # The light on a parked object does not change: its colours vary with the direction of view.
+    varies = colour if track.moves else None
     return _shadings.get(cloud, (light_map, *steps), make)
 
 

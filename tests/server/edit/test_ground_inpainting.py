@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from real2sim_proto.operations import Delete, Translate
+from real2sim_proto.operations import Delete, Rotate, Translate
 from real2sim_server.edit import ScenarioState, apply_operations, vacated_parking
 from real2sim_server.edit.appearance import inpaint_ground
 from real2sim_server.scene import UNSEEN, GaussianCloud
@@ -34,7 +34,11 @@ def state(tiny_scene) -> ScenarioState:
 
 @pytest.mark.parametrize(
     "operation",
-    [Delete(object_id=PARKED), Translate(object_id=PARKED, y=2.0)],
+    [
+        Delete(object_id=PARKED),
+        Translate(object_id=PARKED, y=2.0),
+        Rotate(object_id=PARKED, angle=0.5),
+    ],
 )
 def test_removing_a_parked_object_uncovers_its_place(tiny_scene, state, operation):
     assert at(tiny_scene, state, operation) == (PARKED,)

@@ -13,7 +13,7 @@ from real2sim_server.edit import ScenarioState, apply_operations, instances_at
 from real2sim_server.edit.light import cast_shadow, shaded
 from real2sim_server.geometry import transform_from, yaw_quaternion
 from real2sim_server.scene import GaussianCloud, Ground, Scene, SceneObject, Sunlight, Trajectory
-from real2sim_server.scene.cloud import SH_C0
+from real2sim_server.scene.cloud import SH_C0, TimeColour
 from real2sim_server.scene.sunlight import LightMap
 
 SIZE = (4.0, 2.0, 2.0)
@@ -170,6 +170,33 @@ def test_an_object_at_the_edge_of_the_shade_is_half_dark(street):
 
     np.testing.assert_allclose(after[roof & (x > -1.7) & (x < -1.2)], before[0], atol=0.02)
     np.testing.assert_allclose(after[roof & (x > 1.2) & (x < 1.7)], before[0] / 2, atol=0.02)
+
+
+def test_a_brief_shade_that_the_colours_do_not_follow_changes_nothing(street):
+    x, y = np.meshgrid(np.arange(-20, 20, 0.2), np.arange(-20, 40, 0.2), indexing="ij")
+    places = np.stack([x.ravel(), y.ravel()], axis=1)
+    bright = np.where(np.abs(places[:, 1] - 20) < 2, 0.25, 0.5).astype(np.float32)
+    striped = LightMap(SUN, places, np.repeat(bright[:, None], 3, axis=1))
+    times = np.array([0, 50_000_000])
+    heading = np.tile(yaw_quaternion(np.pi / 2), (2, 1))
+    path = Trajectory(times, np.array([[0.0, -15, 1], [0.0, 35, 1]]), heading)
+    cloud = street.objects["car"].cloud
+    slow = TimeColour(torch.full((len(cloud), 2, 3), 0.01), "cosine", *times.tolist())
+    car = replace(street.objects["car"], trajectory=path, colour=slow)
+
+    elsewhere, _ = shaded(car, path.transform(10_000_000), 35_000_000, striped)
+
+    np.testing.assert_allclose(colours(elsewhere), colours(cloud), rtol=0.12)
+
+
+def test_colours_of_an_edited_parked_object_do_not_change_over_time(street):
+    car = street.objects["car"]
+    coefficients = torch.full((len(car.cloud), 2, 3), 0.1)
+    flickering = replace(car, colour=TimeColour(coefficients, "cosine", 0, 1_000_000))
+
+    _, colour = shaded(flickering, transform_from([5.0, 0, 1], yaw_quaternion(1.0)), 0, sunny())
+
+    assert colour is None
 
 
 def test_scenes_with_the_same_object_shade_it_each_in_its_own_light(street):
