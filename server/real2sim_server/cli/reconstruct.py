@@ -291,11 +291,12 @@ def _print_edits(scores: Sequence[EditScore]) -> None:
     if not scores:
         console.print("no compared frame shows a vehicle of the scene that could be edited")
         return
-    table = Table(title="edited vehicles, where edits change the street", title_justify="left")
+    title = escape("edited vehicles: PSNR [dB] where edits change the street")
+    table = Table(title=title, title_justify="left")
     table.add_column("vehicle", overflow="fold")
     table.add_column("edit", overflow="fold")
-    for name in ("PSNR [dB]", "SSIM", "pixels", "views", "ground", "shadows", "unseen"):
-        table.add_column(escape(name), justify="right")
+    for name in ("PSNR", "SSIM", "ground", "shadows", "unseen"):
+        table.add_column(name, justify="right")
     for score in scores:
         ratios = (score.psnr_hidden_ground, score.psnr_shadows, score.psnr_unseen)
         table.add_row(
@@ -303,8 +304,6 @@ def _print_edits(scores: Sequence[EditScore]) -> None:
             score.edit,
             f"{score.psnr:.2f}",
             f"{score.ssim:.3f}",
-            str(score.pixels),
-            str(len(score.views)),
             *("–" if math.isnan(ratio) else f"{ratio:.2f}" for ratio in ratios),
         )
     console.print(table)

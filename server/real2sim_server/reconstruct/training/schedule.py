@@ -201,9 +201,10 @@ PRESETS: dict[str, TrainOptions] = {
             object_voxel=0.05,
             sky_resolution=128,
         ),
-        # The default rates are for 30,000 iterations; fewer steps have to be larger.
+        # The default rates are for 30,000 iterations; fewer steps have to be larger. Rotations do
+        # not: surfaces of vehicles would turn towards the few directions that see them.
         learning_rates=LearningRates(
-            means=(3.2e-3, 1.6e-4), scales=0.02, quats=0.01, colour=0.01, fourier=5e-3
+            means=(3.2e-3, 1.6e-4), scales=0.02, colour=0.01, fourier=5e-3
         ),
         densify=DensifyOptions(max_gaussians=300_000, every=100, stop=0.7, reset_every=0),
     ),
