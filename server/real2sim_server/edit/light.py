@@ -309,7 +309,8 @@ def shaded(
             """Normals, and the share [POSES, N] of the sun over the recording."""
             return _outward(cloud), np.array([lit(track.transform(t)) for t in times])
 
-        times = np.linspace(track.start_us, track.end_us, POSES).astype(np.int64)
+        share = (np.arange(POSES) + 0.5) / POSES
+        times = (track.start_us + share * (track.end_us - track.start_us)).astype(np.int64)
         normals, shares = _surfaces.get(cloud, light_map, surface)
         was = shares.mean(axis=0)
         if varies is not None:
@@ -317,7 +318,7 @@ def shaded(
             # image shows have the mean light at all times.
             moving = (varies.coefficients != 0).flatten(1).any(1).cpu().numpy()
             weights = (1 + 2 * varies.tones_of(times) @ varies.tones(t_us).numpy()) / POSES
-            was[moving] = (weights @ shares[:, moving] / weights.sum()).clip(0, 1)
+            was[moving] = (weights @ shares[:, moving] / max(weights.sum(), 0.5)).clip(0, 1)
         sun = light_map.sun
         before = sun.on(normals @ recorded[:3, :3].T, was)
         after = sun.on(normals @ T_world_object[:3, :3].T, lit(T_world_object))

@@ -531,12 +531,12 @@ def _shown_paints(
 def _shown_palette(
     surfaces: Sequence[VehicleSurface], lit: Sequence[NDArray[np.float32]]
 ) -> NDArray[np.float32]:
-    parts, colours, upright = [], [], []
+    parts, colours, upright = [], [], [np.zeros(0, np.float32)]
     for surface, bright in zip(surfaces, lit, strict=True):
         parts.append(surface.parts(reach=ON_PART)[surface.seen])
         colours.append(relight(surface.colours, 1 / bright)[surface.seen])
         upright.append(bright[np.abs(surface.normals[:, 2]) < UPRIGHT].ravel())
-    usual = np.concatenate(upright) if upright else np.ones(0)
+    usual = np.concatenate(upright)
     return fit_palette(parts, colours, float(np.median(usual)) if len(usual) else 1.0)
 
 

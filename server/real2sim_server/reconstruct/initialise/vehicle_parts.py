@@ -149,7 +149,7 @@ def default_palette() -> Colours:
 
 
 def fit_palette(
-    parts: Sequence[NDArray[np.uint8]], colours: Sequence[NDArray[np.float32]], light: float = 1.0
+    parts: Sequence[NDArray[np.uint8]], colours: Sequence[NDArray[np.float32]], light: float
 ) -> Colours:
     """Colours [10, 3] by part, with FITTED parts as observed on the vehicles of a log.
 
