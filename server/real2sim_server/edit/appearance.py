@@ -38,13 +38,13 @@ HIDDEN = 3.0
 """Ground that no image shows is continued up to this far from the box [m]."""
 
 SQUARE = 0.3
-"""Ground is hidden in squares of this size in which nothing was seen [m]."""
+"""Edge of the squares in which ground is hidden if nothing was seen there [m]."""
 
 RIM = 1.2
-"""Width of the ground around, from which it is continued [m]."""
+"""Width of the known ground from which hidden ground is continued [m]."""
 
 FADING = 0.3
-"""Distance in which differences from the continued lines fade [m]."""
+"""Distance over which differences from the continued lines fade [m]."""
 
 CELL = 0.08
 """Edge of the cells from which the ground is continued [m]."""
@@ -67,12 +67,7 @@ def vacated_parking(state: ScenarioState, poses: Mapping[str, Float]) -> tuple[s
         recorded.object_id
         for recorded in state.recorded.values()
         if _parked(recorded)
-        and (
-            _away(poses[recorded.object_id], recorded)
-            if recorded.object_id in poses
-            # An unedited object without a pose was not recorded at that time.
-            else state.objects[recorded.object_id] is not recorded
-        )
+        and _vacated(recorded, state.objects[recorded.object_id], poses.get(recorded.object_id))
     )
 
 
@@ -136,7 +131,7 @@ def inpaint_ground(scene: Scene, background: GaussianCloud, left: Iterable[str])
         height = local[:, 2] + half[2]
         level = height.abs() <= LOW
         opacities[(beyond <= 0) & (height > LOW) & (local[:, 2] <= half[2])] = 0.0
-        # Those below the ground show through it.
+        # Gaussians below the ground would show through it.
         unknown = (height <= LOW) & (height > -half[2]) & (beyond <= MARGIN)
         known = level & ~unknown & (opacities > 0.1)
         if uncertainties is not None:
@@ -153,11 +148,17 @@ def _parked(recorded: ObjectState) -> bool:
     return bool((high - low - 2 * recorded.radius).max() <= PARKED)
 
 
-def _away(pose: Float, parked: ObjectState) -> bool:
+def _vacated(parked: ObjectState, now: ObjectState, pose: Float | None) -> bool:
+    if pose is None:
+        # An unedited object without a pose was not recorded at that time.
+        return now is not parked
     (low_x, low_y), (high_x, high_y) = parked.bounds[:, :2].tolist()
     x, y = float(pose[0, 3]), float(pose[1, 3])
-    away = math.hypot(x - (low_x + high_x) / 2, y - (low_y + high_y) / 2) > AWAY
-    return away or float(pose[:3, 0] @ parked.trajectory.middle[:3, 0]) < TURNED
+    if math.hypot(x - (low_x + high_x) / 2, y - (low_y + high_y) / 2) > AWAY:
+        return True
+    # Headings of recorded tracks can be noisy.
+    edited = now.trajectory is not parked.trajectory
+    return edited and float(pose[:3, 0] @ parked.trajectory.middle[:3, 0]) < TURNED
 
 
 def _relight(sh: Tensor, rows: Tensor, places: Float, light_map: LightMap) -> None:

@@ -274,7 +274,10 @@ SHADING_RANGE = (0.1, 10.0)
 """Limits of the change of light."""
 
 DARKEST = 0.02
-"""Colours darker than this change like this one."""
+"""Darker colours change by the same factor as this one."""
+
+MOMENTS = 64
+"""Shadings are cached for this many moments of a recording, if its colours vary."""
 
 
 _shadings: Recent[GaussianCloud, tuple[GaussianCloud, TimeColour | None]] = Recent(KEPT_SHADINGS)
@@ -292,11 +295,17 @@ def shaded(
         t_us: time [us].
         light_map: of the scene.
     """
-    cloud, colour, track = item.cloud, item.colour, item.trajectory
+    cloud, track = item.cloud, item.trajectory
+    # The light on a parked object does not change: its colours vary with the direction of view.
+    colour = item.colour if track.moves else None
+    step_us = max(1, (track.end_us - track.start_us) // MOMENTS)
+    moment_us = 0
+    if colour is not None:
+        moment_us = track.start_us + round((t_us - track.start_us) / step_us) * step_us
     recorded = track.transform(min(max(t_us, track.start_us), track.end_us))
     steps = tuple(_step(pose) for pose in (recorded, T_world_object))
     if steps[0] == steps[1]:
-        return cloud, colour
+        return cloud, item.colour
 
     def make() -> tuple[GaussianCloud, TimeColour | None]:
         points = cloud.means.cpu().double().numpy()
@@ -306,32 +315,29 @@ def shaded(
             return light_map.lit_above(apply_transform(pose, points), points[:, 2] + height)
 
         def surface() -> tuple[Float, Float]:
-            """Normals, and the share [POSES, N] of the sun over the recording."""
-            return _outward(cloud), np.array([lit(track.transform(t)) for t in times])
+            """Normals, and the share [T, N] of the sun over the recording."""
+            return _outward(cloud), np.array([lit(pose) for pose in track.spread(POSES)])
 
-        share = (np.arange(POSES) + 0.5) / POSES
-        times = (track.start_us + share * (track.end_us - track.start_us)).astype(np.int64)
         normals, shares = _surfaces.get(cloud, light_map, surface)
         was = shares.mean(axis=0)
-        if varies is not None:
+        if colour is not None:
             # The colours follow the light as far as their few basis functions can. Sides that no
             # image shows have the mean light at all times.
-            moving = (varies.coefficients != 0).flatten(1).any(1).cpu().numpy()
-            weights = (1 + 2 * varies.tones_of(times) @ varies.tones(t_us).numpy()) / POSES
-            was[moving] = (weights @ shares[:, moving] / max(weights.sum(), 0.5)).clip(0, 1)
+            varies = (colour.coefficients != 0).flatten(1).any(1).cpu().numpy()
+            tones = colour.tones_of(track.spread_times(POSES)) @ colour.tones(moment_us).numpy()
+            weights = (1 + 2 * tones) / len(tones)
+            was[varies] = (weights @ shares[:, varies] / max(weights.sum(), 0.5)).clip(0, 1)
         sun = light_map.sun
         before = sun.on(normals @ recorded[:3, :3].T, was)
         after = sun.on(normals @ T_world_object[:3, :3].T, lit(T_world_object))
         shown = (cloud.sh[:, 0].cpu().numpy() * SH_C0 + 0.5).clip(DARKEST, 1)
         factors = relight(shown, np.clip(after / before, *SHADING_RANGE)) / shown
         gain = torch.from_numpy(factors).to(cloud.sh)
-        if varies is None:
+        if colour is None:
             return relit(cloud, gain), None
-        return relit(cloud, gain), replace(varies, coefficients=varies.coefficients * gain[:, None])
+        return relit(cloud, gain), replace(colour, coefficients=colour.coefficients * gain[:, None])
 
-    # The light on a parked object does not change: its colours vary with the direction of view.
-    varies = colour if track.moves else None
-    return _shadings.get(cloud, (light_map, *steps), make)
+    return _shadings.get(cloud, (light_map, moment_us, *steps), make)
 
 
 def _step(pose: Float) -> tuple[int, ...]:

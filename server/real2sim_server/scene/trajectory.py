@@ -116,15 +116,15 @@ class Trajectory:
         """``T_world_object`` [4, 4] in the middle of the time span."""
         return self.transform((self.start_us + self.end_us) // 2)
 
-    def spread(self, count: int) -> Float:
-        """``T_world_object`` [count, 4, 4] at evenly spaced times.
-
-        A trajectory that stands still has only the pose in the middle, [1, 4, 4].
-        """
+    def spread_times(self, count: int) -> NDArray[np.int64]:
+        """``count`` evenly spaced times [us]; only the middle one if it stands still."""
         if not self.moves:
-            return self.middle[None]
-        times = np.linspace(self.start_us, self.end_us, count).astype(np.int64)
-        return np.stack([self.transform(int(t)) for t in times])
+            return np.array([(self.start_us + self.end_us) // 2])
+        return np.linspace(self.start_us, self.end_us, count).astype(np.int64)
+
+    def spread(self, count: int) -> Float:
+        """``T_world_object`` [T, 4, 4] at :meth:`spread_times`."""
+        return np.stack([self.transform(int(t)) for t in self.spread_times(count)])
 
     def covers(self, t_us: int) -> bool:
         """Whether a pose is known at ``t_us``."""

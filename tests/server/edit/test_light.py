@@ -189,6 +189,24 @@ def test_a_brief_shade_that_the_colours_do_not_follow_changes_nothing(street):
     np.testing.assert_allclose(colours(elsewhere), colours(cloud), rtol=0.12)
 
 
+def test_the_shading_of_an_object_that_waits_does_not_depend_on_earlier_calls(street):
+    times = np.arange(0, 50_000_000, 10_000_000)
+    positions = np.zeros((len(times), 3))
+    positions[:, 1], positions[:, 2] = [0, 18, 18, 18, 36], 1
+    path = Trajectory(times, positions, np.tile([1.0, 0, 0, 0], (len(times), 1)))
+    colour = TimeColour(torch.full((len(block()), 2, 3), 0.01), "cosine", 0, int(times[-1]))
+    turned, light_map = transform_from([0.0, 18, 1], yaw_quaternion(np.pi)), sunny()
+
+    def shade(cloud: GaussianCloud, *moments: int) -> np.ndarray:
+        car = replace(street.objects["car"], cloud=cloud, trajectory=path, colour=colour)
+        return [colours(shaded(car, turned, t_us, light_map)[0]) for t_us in moments][-1]
+
+    late = shade(block(), 29_000_000)
+
+    np.testing.assert_array_equal(shade(block(), 11_000_000, 29_000_000), late)
+    assert np.abs(shade(block(), 11_000_000) - late).max() > 0.01
+
+
 def test_colours_of_an_edited_parked_object_do_not_change_over_time(street):
     car = street.objects["car"]
     coefficients = torch.full((len(car.cloud), 2, 3), 0.1)

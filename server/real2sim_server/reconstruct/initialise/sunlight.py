@@ -19,8 +19,8 @@ from .vehicle_body import VEHICLE_LENGTH
 # Ground that a vehicle passes is darker while its shadow is there. Each candidate direction
 # predicts which points are in the shadow of the vehicle. The best one explains most of the variance
 # of the brightness of each place over time, so what does not move has no influence: road markings,
-# pavements, and the shadows of houses. The vehicle is a stack of boxes, because the shadow of its
-# own box would be longer than that of its body, and the sun too high.
+# pavements, and the shadows of houses. A vehicle is a stack of boxes here: the shadow of its whole
+# box is longer than that of its body, so the sun would come out too high.
 
 MAX_VIEWS = 64
 """Maximum number of images, evenly spread."""
@@ -39,7 +39,7 @@ MIN_CELLS = 30
 AZIMUTHS = np.deg2rad(np.arange(0.0, 360.0, 15.0))
 ELEVATIONS = np.deg2rad(np.arange(16.0, 80.0, 12.0))
 FINER = tuple(np.deg2rad(np.arange(-2, 3) * step) for step in (3.0, 1.0))
-"""Offsets of the next searches [rad]."""
+"""Offsets of the two finer searches [rad]."""
 SLICES = 4
 """Number of boxes, one above the other, that a vehicle consists of."""
 EDGE = 0.05

@@ -22,11 +22,11 @@ from .surfels import GREY, Surfels, fill_from_mirror, modal_colour
 from .vehicle_parts import (
     Light,
     Part,
-    brightness,
     fit_light,
     fit_palette,
     shell_parts,
     shown_paints,
+    slope_light,
     wheel_parts,
     with_paints,
 )
@@ -508,7 +508,7 @@ def fill_vehicles(
         [s.normals[mine] for s, mine in zip(surfaces, painted, strict=True)],
         [s.colours[mine] for s, mine in zip(surfaces, painted, strict=True)],
     )
-    shared: list[Light] = [partial(brightness, light)] * len(surfaces)
+    shared: list[Light] = [partial(slope_light, light)] * len(surfaces)
     lit = [on(s.normals) for s, on in zip(surfaces, lights or shared, strict=True)]
     paints = [_shown_paints(s, bright) for s, bright in zip(surfaces, lit, strict=True)]
     palette = _shown_palette(surfaces, lit)

@@ -65,9 +65,9 @@ def fit_light(normals: Sequence[Float], colours: Sequence[NDArray[np.float32]]) 
     return np.asarray(prior + found[:3])
 
 
-def brightness(light: Float, normals: Float) -> NDArray[np.float32]:
-    """Light [N, 1] on surfaces with unit ``normals`` [N, 3], 1 on average."""
-    return np.exp(DISPLAY * (normals @ light))[:, None].astype(np.float32)
+def slope_light(slopes: Float, normals: Float) -> NDArray[np.float32]:
+    """Light [N, 1] on surfaces with unit ``normals`` [N, 3]; slopes as of :func:`fit_light`."""
+    return np.exp(DISPLAY * (normals @ slopes))[:, None].astype(np.float32)
 
 
 def light_on(item: SceneObject, scene: Scene) -> Light:
@@ -83,7 +83,7 @@ def light_on(item: SceneObject, scene: Scene) -> Light:
     reconstruction = scene.provenance.get("reconstruction")
     known = reconstruction.get(LIGHT) if isinstance(reconstruction, dict) else None
     slopes = np.array(FROM_ABOVE if known is None else known, dtype=np.float64)
-    return lambda normals: brightness(slopes, normals @ axes.T)
+    return lambda normals: slope_light(slopes, normals @ axes.T)
 
 
 # Parts and colours.

@@ -19,11 +19,11 @@ from real2sim_server.reconstruct.initialise.vehicle_parts import (
     FROM_ABOVE,
     PARTS,
     Part,
-    brightness,
     default_palette,
     fit_light,
     light_on,
     palette_of,
+    slope_light,
     with_paints,
 )
 from real2sim_server.reconstruct.initialise.vehicle_parts import LIGHT as LIGHT_KEY
@@ -46,7 +46,7 @@ def surface(body, paint, *, light, seen_from=(-1, 0, 0), turned=0.0) -> VehicleS
     """A car of one paint, rotated by ``turned`` [rad] and observed from one side."""
     c, s = np.cos(turned), np.sin(turned)
     normals = body.unit_normals() @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T
-    colours = relight(np.tile(paint, (len(normals), 1)), brightness(light, normals))
+    colours = relight(np.tile(paint, (len(normals), 1)), slope_light(light, normals))
     seen = body.unit_normals() @ np.array(seen_from, float) > 0.4
     return VehicleSurface(body.points.astype(np.float32), normals, colours, seen, body)
 
