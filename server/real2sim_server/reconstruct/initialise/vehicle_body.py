@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from ...geometry import Float, invert_transform
 from ...logs import DrivingLog, ObjectTrack
-from ...scene import Scene
+from ...scene import Scene, SceneObject
+from ...scene.cloud import SH_C0
 from ...scene.sunlight import relight
 from ...synthetic.materials import BODY, PLAIN, WHEEL
 from ...synthetic.vehicles import CARGO_FLOOR, SHAPES, VehicleShape, build_vehicle
@@ -24,6 +25,8 @@ from .vehicle_parts import (
     Part,
     fit_light,
     fit_palette,
+    light_on,
+    palette_of,
     shell_parts,
     shown_paints,
     slope_light,
@@ -38,10 +41,14 @@ from .vehicle_parts import (
 
 SPACING = 0.05
 """Distance between points on a body [m]."""
+FINE_SPACING = 0.033
+"""The same at borders of parts, which would be blurred or ragged otherwise [m]."""
 WIDE_SPACING = 0.12
 """Spacing of rendered points on flat regions of a single part [m]."""
 FLAT = 0.95
 """Minimum cosine between normals of neighbours on a flat body."""
+FACING_DOWN = -0.5
+"""Maximum vertical component of the normals of undersides, which are drawn as flat regions."""
 FEW_POINTS = 50
 """Minimum number of measured points to distinguish shapes."""
 COMPARED = 1500
@@ -155,29 +162,20 @@ def scene_bodies(scene: Scene) -> list[VehicleBody | None]:
     ]
 
 
-def body_colours(
-    body: VehicleBody,
-    points: NDArray[np.float32],
-    colours: NDArray[np.float32],
-    *,
-    light: Light,
-    palette: NDArray[np.float32],
-) -> NDArray[np.float32]:
-    """Colours [B, 3] of the points of a body under the given light.
+def body_colours(body: VehicleBody, item: SceneObject, scene: Scene) -> NDArray[np.float32]:
+    """Colours [B, 3] of the points of a body in the paint and light of an object of stage 0.
 
-    Args:
-        points: [N, 3] of a vehicle in that box, from stage 0.
-        colours: [N, 3] of these points. The most common colour of painted points, with the light
-        removed, becomes the paint. A truck's cargo is handled likewise.
-        light: light on it, for normals in the frame of the box.
-        palette: colours [10, 3] of parts, see :func:`.vehicle_parts.fit_palette`.
+    The most common colour of its painted points, with the light removed, becomes the paint. A
+    truck's cargo is handled likewise.
     """
-    distance, nearest = body.closest(points)
-    lit = light(body.unit_normals())
+    distance, nearest = body.closest(item.cloud.means.cpu().numpy())
+    lit = light_on(item, scene)(body.unit_normals())
     # Points far from the body belong to the dark plate under it.
     near = distance < PAINT_REACH
-    plain = relight(colours, 1 / lit[nearest])
+    shown = (0.5 + SH_C0 * item.cloud.sh[:, 0]).cpu().numpy()
+    plain = relight(shown, 1 / lit[nearest])
     usual = modal_colour(plain) if len(plain) else GREY
+    palette = palette_of(scene.provenance.get("reconstruction"))
     own = with_paints(palette, shown_paints(body.parts[nearest[near]], plain[near]), usual)
     return np.clip(relight(body.colours(own), lit), 0, 1)
 
@@ -235,7 +233,8 @@ def _body(shape: VehicleShape) -> VehicleBody:
     order = np.argsort(mesh.material[triangle] != WHEEL, kind="stable")
     triangle, weights = triangle[order], weights[order]
     points = np.einsum("nk,nkd->nd", weights, mesh.corners[triangle])
-    _, kept = np.unique(np.floor(points / SPACING).astype(np.int64), axis=0, return_index=True)
+    coarse, fine = (_one_per_cell(points, size) for size in (SPACING, FINE_SPACING))
+    kept = np.concatenate([coarse, fine])
     triangle, weights, points = triangle[kept], weights[kept], points[kept]
     normals = np.einsum("nk,nkd->nd", weights, mesh.normals[triangle])
     uv = np.einsum("nk,nkd->nd", weights, mesh.uv[triangle])
@@ -251,8 +250,37 @@ def _body(shape: VehicleShape) -> VehicleBody:
     parts[_on_cargo(shape, points)] = Part.CARGO
     over_ground = points + np.array([0, 0, shape.size[2] / 2])
     parts[on_shell] = shell_parts(shape, over_ground[on_shell], normals[on_shell])
-    drawn = _drawn_spacing(points, normals, parts)
-    return VehicleBody(points, normals, parts, colours.astype(np.float32), drawn)
+    at_border = _at_borders(points, normals, parts)
+    is_fine = np.arange(len(points)) >= len(coarse)
+    kept = np.flatnonzero(at_border == is_fine)
+    points, normals, parts, is_fine = points[kept], normals[kept], parts[kept], is_fine[kept]
+    drawn = np.where(is_fine, FINE_SPACING, _drawn_spacing(points, normals, parts))
+    colours, drawn = (values.astype(np.float32) for values in (colours[kept], drawn))
+    return VehicleBody(points, normals, parts, colours, drawn)
+
+
+def _one_per_cell(points: Float, spacing: float) -> NDArray[np.int64]:
+    """Indices of the first of the points [N, 3] in each cell of a grid."""
+    cells = np.floor(points / spacing).astype(np.int64)
+    return np.unique(cells, axis=0, return_index=True)[1]
+
+
+def _at_borders(points: Float, normals: Float, parts: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Mask [N] of the points in cells of SPACING that a border of unlike parts crosses."""
+    from scipy.spatial import cKDTree
+
+    near = cKDTree(points).query_pairs(1.5 * FINE_SPACING, output_type="ndarray")
+    unit = normals / np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-9)
+    first, second = near.T
+    dark = np.isin(parts, (Part.GLASS, Part.TRIM, Part.TYRE))
+    unlike = (parts[first] != parts[second]) & ~(dark[first] & dark[second])
+    # The opposite side of a thin part does not make a border.
+    same_side = (unit[first] * unit[second]).sum(1) > 0
+    border = near[unlike & same_side & (unit[first, 2] > FACING_DOWN)]
+    _, cell = np.unique(np.floor(points / SPACING).astype(np.int64), axis=0, return_inverse=True)
+    crossed = np.zeros(cell.max() + 1, dtype=np.bool_)
+    crossed[cell[border.ravel()]] = True
+    return crossed[cell]
 
 
 def _drawn_spacing(points: Float, normals: Float, parts: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -267,6 +295,7 @@ def _drawn_spacing(points: Float, normals: Float, parts: NDArray[np.uint8]) -> N
     unlike &= cosine > -0.5
     plain = np.ones(len(points), dtype=np.bool_)
     plain[near[unlike].ravel()] = False
+    plain |= unit[:, 2] < FACING_DOWN
     cells = np.floor(points[plain] / WIDE_SPACING)
     from_centre = np.abs(points[plain] / WIDE_SPACING - cells - 0.5).max(axis=1)
     # Use the point nearest to the middle of each cell, for a uniform spacing.
@@ -311,9 +340,9 @@ def _outwards(shape: VehicleShape, points: Float, material: NDArray[np.int32]) -
 
 
 def _spread(corners: Float) -> tuple[NDArray[np.int64], Float]:
-    """Triangles [N] and barycentric weights [N, 3] of points SPACING apart on [T, 3, 3]."""
+    """Triangles [N] and barycentric weights [N, 3] of points FINE_SPACING apart on [T, 3, 3]."""
     sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
-    steps = np.maximum(1, np.ceil(sides / SPACING)).astype(int)
+    steps = np.maximum(1, np.ceil(sides / FINE_SPACING)).astype(int)
     triangles, weights = [], []
     for n in np.unique(steps):
         i, j = np.array([(i, j) for i in range(n) for j in range(n - i)]).T

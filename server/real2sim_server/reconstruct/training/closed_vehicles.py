@@ -14,15 +14,13 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from ...geometry import matrix_to_quaternion
-from ...scene import GaussianCloud, SceneObject
+from ...scene import GaussianCloud, Scene, SceneObject
 from ...scene.cloud import SH_C0
 from ..initialise.vehicle_body import SPACING, VehicleBody, body_colours
-from ..initialise.vehicle_parts import Light, light_on, palette_of
 from . import kernels
 from .densify import SelectiveAdam, rotation_matrices
 from .gaussians import FIELDS, OBJECT_FIELDS
@@ -31,7 +29,6 @@ from .visibility import (
     OfferedPriors,
     ViewingDirections,
     Viewpoint,
-    constant_colours,
     viewing_directions,
 )
 
@@ -87,14 +84,11 @@ def offer_bodies(
         bodies: bodies of the objects; None for objects without a body.
     """
     scene = model.scene
-    reconstruction = scene.provenance.get("reconstruction")
-    palette = palette_of(reconstruction)
     objects, alternatives = dict(scene.objects), [_no_choice(len(scene.background))]
     for index, (name, item) in enumerate(scene.objects.items()):
         body, insets = bodies[index], INSETS if followed[index] else INSETS[:1]
         if body is not None:
-            light = light_on(item, scene)
-            cloud = body_cloud(body, item, light=light, palette=palette, insets=insets)
+            cloud = body_cloud(body, item, scene, insets=insets)
             objects[name] = replace(item, cloud=cloud)
             alternatives.append(torch.arange(len(cloud) // len(insets)).repeat(len(insets)))
         else:
@@ -105,29 +99,16 @@ def offer_bodies(
 
 
 def body_cloud(
-    body: VehicleBody,
-    item: SceneObject,
-    *,
-    light: Light,
-    palette: NDArray[np.float32],
-    insets: Sequence[float],
+    body: VehicleBody, item: SceneObject, scene: Scene, *, insets: Sequence[float]
 ) -> GaussianCloud:
-    """The whole body once for each inset, in the paint of ``item``.
+    """The whole body once for each inset, in the paint of ``item``, an object of stage 0.
 
-    Flat regions of a single part get fewer, larger Gaussians.
-
-    Args:
-        item: object of stage 0.
-        light: light on it, for normals in its frame.
-        palette: colours [10, 3] of parts, see :func:`.vehicle_parts.fit_palette`.
+    Flat regions of a single part get fewer, larger Gaussians, borders of parts smaller ones.
     """
-    shown = constant_colours(item.cloud)
-    points = item.cloud.means.cpu().numpy()
-    colours = body_colours(body, points, shown.cpu().numpy(), light=light, palette=palette)
     drawn = body.drawn > 0
     spacing = body.drawn[drawn, None]
-    scales = spacing * np.where(spacing > SPACING, DISC, BENT).astype(np.float32)
-    colours = colours[drawn]
+    scales = spacing * np.where(spacing == SPACING, BENT, DISC).astype(np.float32)
+    colours = body_colours(body, item, scene)[drawn]
     factors = np.array([(1 - 0.4 * (1 - f), f, f) for f in insets])
     normals = body.unit_normals()[drawn]
     helper = np.where(np.abs(normals[:, 2:]) < 0.9, [[0.0, 0, 1]], [[1.0, 0, 0]])

@@ -34,6 +34,8 @@ class LossWeights:
             ``needle_ratio``.
         needle_ratio: that ratio (drivestudio: 10).
         smooth: squared second differences of refined object poses [m, rad] (drivestudio: 0.01).
+        box_pose: squared corrections of object poses [m, rad]. Images alone do not determine
+            them: Gaussians can move the other way within their box.
         opacity, scale: mean opacity and mean size [m] (MCMC, Kheradmand et al. 2024: 0.01).
         exposure: squared distance of exposures from the identity, and squared logarithms of the
             gains of images.
@@ -47,6 +49,7 @@ class LossWeights:
     needle: float = 0.01
     needle_ratio: float = 10.0
     smooth: float = 0.01
+    box_pose: float = 0.1
     opacity: float = 0.0
     scale: float = 0.0
     exposure: float = 0.1

@@ -173,6 +173,11 @@ class ObjectPoses:
         ]
         return torch.stack(terms).mean() if terms else self.shifts.sum() * 0
 
+    def departure(self) -> Tensor:
+        """Mean squared corrections [m, rad] of all poses."""
+        corrections = torch.cat([self.shifts, self.yaws, self.tilts], dim=1)
+        return corrections.square().sum(dim=1).mean()
+
     def _refined(self, key: KeyPoses) -> tuple[Tensor, Tensor, Tensor]:
         """World positions [T, 3] about their mean, unwrapped yaws [T, 1] and corrections of roll
         and pitch [T, 2], float32."""

@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 from ...render import Instance, RasterOptions, rasterize
-from ...scene import Camera, GaussianCloud, Scene, Sky
+from ...scene import Camera, Scene, Sky
 from ...scene.cloud import SH_C0
-from ..initialise.vehicle_body import GRAZING, VehicleBody
+from ..initialise.vehicle_body import GRAZING, VehicleBody, body_colours
 from .densify import DensifyOptions, SelectiveAdam, VisibilityLimits, prune, rotation_matrices
 from .gaussians import Gaussians, concatenate
 from .model import SceneModel
@@ -583,11 +583,11 @@ def _body_normals(model: SceneModel, bodies: Sequence[VehicleBody | None]) -> tu
 def paint_unseen_sides(
     model: SceneModel, viewpoints: Sequence[Viewpoint], bodies: Sequence[VehicleBody | None]
 ) -> None:
-    """Give sides of vehicles that images show only edge-on the frontal colours of stage 0.
+    """Give sides of vehicles that images show only edge-on the colours of their bodies.
 
     The colour of each of these Gaussians changes linearly from its learnt value, in the mean
-    direction of the images, to the initial colour at its position, against the normal. The colour
-    visible in the images stays.
+    direction of the images, to the colour of the body at its position, against the normal. The
+    colour visible in the images stays.
     """
     normals, known = _body_normals(model, bodies)
     seen = viewing_directions(model, viewpoints, normals=normals, objects_only=True)
@@ -599,7 +599,7 @@ def paint_unseen_sides(
     slopes = sh[rows, 1:4].roll(1, dims=1) * signs * SH_C1
     mean = seen.means[rows]
     shown = 0.5 + SH_C0 * sh[rows, 0] + (slopes * mean[:, :, None]).sum(1)
-    wanted = _initial_colours(model, rows)
+    wanted = _body_colours(model, bodies, rows)
     way = -normals[rows] - mean
     way /= way.square().sum(-1, keepdim=True).clamp(min=0.5)
     slopes = way[:, :, None] * (wanted - shown)[:, None]
@@ -609,25 +609,18 @@ def paint_unseen_sides(
     sh[rows, 4:] = 0
 
 
-def _initial_colours(model: SceneModel, rows: Tensor) -> Tensor:
-    """Colours [M, 3] of stage 0 at the positions of the object Gaussians ``rows`` [M]."""
-    from scipy.spatial import cKDTree
-
+def _body_colours(model: SceneModel, bodies: Sequence[VehicleBody | None], rows: Tensor) -> Tensor:
+    """Colours [M, 3] of the bodies at the positions of the object Gaussians ``rows`` [M]."""
     starts = model.gaussians.starts
     colours = torch.zeros(len(rows), 3, device=model.device)
-    for index, item in enumerate(model.scene.objects.values()):
+    for index, (item, body) in enumerate(zip(model.scene.objects.values(), bodies, strict=True)):
         mine = (rows >= starts[index + 1]) & (rows < starts[index + 2])
-        if not bool(mine.any()) or not len(item.cloud):
+        if body is None or not bool(mine.any()):
             continue
-        tree = cKDTree(item.cloud.means.detach().cpu().numpy())
-        _, near = tree.query(model.gaussians.means[rows[mine]].detach().cpu().numpy(), k=1)
-        colours[mine] = constant_colours(item.cloud)[torch.from_numpy(near)].to(colours)
+        near = body.nearest(model.gaussians.means[rows[mine]].detach().cpu().numpy())
+        painted = body_colours(body, item, model.scene)[near]
+        colours[mine] = torch.from_numpy(painted).to(colours)
     return colours
-
-
-def constant_colours(cloud: GaussianCloud) -> Tensor:
-    """The part of colours [N, 3] that does not depend on the direction."""
-    return 0.5 + SH_C0 * cloud.sh[:, 0]
 
 
 @torch.no_grad()

@@ -1,12 +1,22 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import torch
 from scipy.spatial import cKDTree
 
 from real2sim_server.reconstruct.initialise.accumulate import PointSet
-from real2sim_server.reconstruct.initialise.vehicle_body import body_colours, faced, fitted_body
-from real2sim_server.reconstruct.initialise.vehicle_parts import Part, default_palette, wheel_parts
+from real2sim_server.reconstruct.initialise.vehicle_body import (
+    FINE_SPACING,
+    body_colours,
+    faced,
+    fitted_body,
+)
+from real2sim_server.reconstruct.initialise.vehicle_parts import LIGHT, Part, wheel_parts
+from real2sim_server.scene import GaussianCloud
+from real2sim_server.scene.cloud import SH_C0
 from real2sim_server.synthetic.vehicles import SHAPES
 
 from ..conftest import painted_log
@@ -19,8 +29,19 @@ def near(body, place) -> Part:
     return Part(body.parts_near(np.array([place], np.float32))[1][0])
 
 
-def even_light(normals):
-    return np.ones((len(normals), 1), np.float32)
+def painted(scene, body, points, colours):
+    """Colours of a body for a vehicle with these points, in even light."""
+    count = len(points)
+    cloud = GaussianCloud(
+        torch.as_tensor(points, dtype=torch.float32),
+        torch.tensor([[1.0, 0, 0, 0]]).expand(count, 4),
+        torch.full((count, 3), 0.05),
+        torch.full((count,), 0.9),
+        (torch.as_tensor(colours, dtype=torch.float32)[:, None] - 0.5) / SH_C0,
+    )
+    item = replace(next(iter(scene.objects.values())), cloud=cloud)
+    even = {"reconstruction": {LIGHT: [0.0, 0.0, 0.0]}}
+    return body_colours(body, item, replace(scene, provenance=even, content_hash=""))
 
 
 def test_measured_points_determine_the_car_shape():
@@ -80,16 +101,13 @@ def test_normals_point_outwards(shape):
 def test_sparse_wide_discs_leave_no_gaps():
     body = fitted_body(np.zeros((0, 3), np.float32), SALOON, "car")
     drawn = body.drawn > 0
-    assert drawn.mean() < 0.65
-    np.testing.assert_allclose(np.unique(body.drawn[drawn]), [0.05, 0.12])
+    assert drawn.mean() < 0.7
+    np.testing.assert_allclose(np.unique(body.drawn[drawn]), [0.033, 0.05, 0.12])
     distance = cKDTree(body.points[drawn]).query(body.points)[0]
     assert distance.max() < 0.15
-    # All points are drawn where parts meet, to keep edges sharp.
-    lamp = body.parts == Part.RED_LAMP
-    assert (body.drawn[lamp] == np.float32(0.05)).mean() > 0.7
 
 
-def test_truck_cargo_has_its_own_colour():
+def test_truck_cargo_has_its_own_colour(tiny_scene):
     truck = next(s for s in SHAPES if s.category == "truck")
     body = fitted_body(np.zeros((0, 3), np.float32), truck.size, "truck")
     behind, ahead = (-0.15 * truck.size[0], 1.19, 0.5), (0.31 * truck.size[0], 1.1, -0.5)
@@ -97,26 +115,18 @@ def test_truck_cargo_has_its_own_colour():
     assert near(body, ahead) is Part.PAINT
     points = body.points.astype(np.float32)
     shown = np.where((body.parts == Part.CARGO)[:, None], (0.6, 0.1, 0.1), (0.1, 0.1, 0.6))
-    colours = body_colours(
-        body, points, shown.astype(np.float32), light=even_light, palette=default_palette()
-    )
+    colours = painted(tiny_scene, body, points, shown)
     for part, paint in ((Part.CARGO, (0.6, 0.1, 0.1)), (Part.PAINT, (0.1, 0.1, 0.6))):
         mine = colours[body.parts == part]
         np.testing.assert_allclose(mine, np.tile(paint, (len(mine), 1)), atol=0.02)
 
 
-def test_the_dark_underside_does_not_affect_the_paint():
+def test_the_dark_underside_does_not_affect_the_paint(tiny_scene):
     body = fitted_body(np.zeros((0, 3), np.float32), SALOON, "car")
     few = body.points[body.is_paint][::40].astype(np.float32)
     plate = np.random.default_rng(0).uniform(-1, 1, (2000, 3)) * (2.2, 0.8, 0) - (0, 0, 1.2)
     colours = np.concatenate([np.full((len(few), 3), 0.6), np.full((len(plate), 3), 0.05)])
-    found = body_colours(
-        body,
-        np.concatenate([few, plate.astype(np.float32)]),
-        colours.astype(np.float32),
-        light=even_light,
-        palette=default_palette(),
-    )
+    found = painted(tiny_scene, body, np.concatenate([few, plate]), colours)
     np.testing.assert_allclose(found[body.is_paint], 0.6, atol=0.02)
 
 
@@ -145,3 +155,14 @@ def test_only_surfaces_towards_the_camera_are_faced():
     normals = np.array([[-1.0, 0, 0], [0, 1, 0], [1, 0, 0], [0, 0, 1]])
     found = faced(log, track, points, normals, [log.frame_count // 2])
     assert found.tolist() == [True, False, False, False]
+
+
+def test_borders_of_parts_are_drawn_finer_than_the_middle_of_a_door():
+    body = fitted_body(np.zeros((0, 3), np.float32), SALOON, "car")
+    flank = np.abs(body.unit_normals()[:, 1]) > 0.7
+    drawn, paint = flank & (body.drawn > 0), body.parts == Part.PAINT
+    to_other, _ = cKDTree(body.points[body.parts != Part.PAINT]).query(body.points)
+    beside, apart = drawn & paint & (to_other < 0.03), drawn & paint & (to_other > 0.15)
+    np.testing.assert_allclose(body.drawn[beside], FINE_SPACING)
+    assert (body.drawn[apart] > FINE_SPACING).all()
+    assert beside.sum() > 100 < apart.sum()

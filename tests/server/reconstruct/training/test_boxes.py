@@ -57,7 +57,7 @@ def test_training_corrects_a_shifted_box(tiny_log, tiny_scene):
     shifted = _shifted(tiny_scene, name, 0.25)
     options = replace(
         TINY,
-        iterations=40,
+        iterations=80,
         hold_out=0,
         pose_start=0.0,
         harmonics=0,
