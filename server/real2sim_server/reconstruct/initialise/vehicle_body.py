@@ -42,7 +42,7 @@ from .vehicle_parts import (
 SPACING = 0.05
 """Distance between points on a body [m]."""
 FINE_SPACING = 0.033
-"""The same at borders of parts, which would be blurred or ragged otherwise [m]."""
+"""Distance between points where unlike parts meet, to keep their edges sharp [m]."""
 WIDE_SPACING = 0.12
 """Spacing of rendered points on flat regions of a single part [m]."""
 FLAT = 0.95
@@ -175,7 +175,7 @@ def body_colours(body: VehicleBody, item: SceneObject, scene: Scene) -> NDArray[
     shown = (0.5 + SH_C0 * item.cloud.sh[:, 0]).cpu().numpy()
     plain = relight(shown, 1 / lit[nearest])
     usual = modal_colour(plain) if len(plain) else GREY
-    palette = palette_of(scene.provenance.get("reconstruction"))
+    palette = palette_of(scene)
     own = with_paints(palette, shown_paints(body.parts[nearest[near]], plain[near]), usual)
     return np.clip(relight(body.colours(own), lit), 0, 1)
 
@@ -250,13 +250,14 @@ def _body(shape: VehicleShape) -> VehicleBody:
     parts[_on_cargo(shape, points)] = Part.CARGO
     over_ground = points + np.array([0, 0, shape.size[2] / 2])
     parts[on_shell] = shell_parts(shape, over_ground[on_shell], normals[on_shell])
-    at_border = _at_borders(points, normals, parts)
+    unit = normals / np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-9)
     is_fine = np.arange(len(points)) >= len(coarse)
-    kept = np.flatnonzero(at_border == is_fine)
-    points, normals, parts, is_fine = points[kept], normals[kept], parts[kept], is_fine[kept]
-    drawn = np.where(is_fine, FINE_SPACING, _drawn_spacing(points, normals, parts))
-    colours, drawn = (values.astype(np.float32) for values in (colours[kept], drawn))
-    return VehicleBody(points, normals, parts, colours, drawn)
+    # Fine points where unlike parts meet, coarse ones elsewhere.
+    kept = np.flatnonzero(_at_borders(points, unit, parts) == is_fine)
+    points, normals, parts = points[kept], normals[kept], parts[kept]
+    drawn = _drawn_spacing(points, unit[kept], parts)
+    drawn[is_fine[kept]] = FINE_SPACING
+    return VehicleBody(points, normals, parts, colours[kept].astype(np.float32), drawn)
 
 
 def _one_per_cell(points: Float, spacing: float) -> NDArray[np.int64]:
@@ -265,12 +266,14 @@ def _one_per_cell(points: Float, spacing: float) -> NDArray[np.int64]:
     return np.unique(cells, axis=0, return_index=True)[1]
 
 
-def _at_borders(points: Float, normals: Float, parts: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Mask [N] of the points in cells of SPACING that a border of unlike parts crosses."""
+def _at_borders(points: Float, unit: Float, parts: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Mask [N] of the points in cells of SPACING in which unlike parts meet.
+
+    Dark parts are alike. ``unit`` are normals [N, 3].
+    """
     from scipy.spatial import cKDTree
 
     near = cKDTree(points).query_pairs(1.5 * FINE_SPACING, output_type="ndarray")
-    unit = normals / np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-9)
     first, second = near.T
     dark = np.isin(parts, (Part.GLASS, Part.TRIM, Part.TYRE))
     unlike = (parts[first] != parts[second]) & ~(dark[first] & dark[second])
@@ -283,12 +286,14 @@ def _at_borders(points: Float, normals: Float, parts: NDArray[np.uint8]) -> NDAr
     return crossed[cell]
 
 
-def _drawn_spacing(points: Float, normals: Float, parts: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """[N]: SPACING at borders of parts and at bends of a body, WIDE_SPACING or 0 elsewhere."""
+def _drawn_spacing(points: Float, unit: Float, parts: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """[N]: SPACING at borders of parts and at bends of a body, WIDE_SPACING or 0 elsewhere.
+
+    ``unit`` are normals [N, 3].
+    """
     from scipy.spatial import cKDTree
 
     near = cKDTree(points).query_pairs(0.75 * WIDE_SPACING, output_type="ndarray")
-    unit = normals / np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-9)
     cosine = (unit[near[:, 0]] * unit[near[:, 1]]).sum(1)
     unlike = (cosine < FLAT) | (parts[near[:, 0]] != parts[near[:, 1]])
     # The opposite side of a thin part does not make an edge.
@@ -300,7 +305,7 @@ def _drawn_spacing(points: Float, normals: Float, parts: NDArray[np.uint8]) -> N
     from_centre = np.abs(points[plain] / WIDE_SPACING - cells - 0.5).max(axis=1)
     # Use the point nearest to the middle of each cell, for a uniform spacing.
     order = np.argsort(from_centre, kind="stable")
-    kept = order[np.unique(cells[order].astype(np.int64), axis=0, return_index=True)[1]]
+    kept = order[_one_per_cell(points[plain][order], WIDE_SPACING)]
     drawn = np.full(len(points), SPACING, dtype=np.float32)
     drawn[plain] = 0
     drawn[np.flatnonzero(plain)[kept]] = WIDE_SPACING

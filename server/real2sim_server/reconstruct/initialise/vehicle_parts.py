@@ -198,8 +198,9 @@ def with_paints(
     return own
 
 
-def palette_of(reconstruction: object) -> Colours:
+def palette_of(scene: Scene) -> Colours:
     """The palette [10, 3] in a scene's provenance; the default one if it is missing."""
+    reconstruction = scene.provenance.get("reconstruction")
     known = reconstruction.get(PARTS) if isinstance(reconstruction, dict) else None
     palette = default_palette()
     if known is not None:

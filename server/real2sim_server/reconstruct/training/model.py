@@ -173,8 +173,8 @@ class ObjectPoses:
         ]
         return torch.stack(terms).mean() if terms else self.shifts.sum() * 0
 
-    def departure(self) -> Tensor:
-        """Mean squared corrections [m, rad] of all poses."""
+    def squares(self) -> Tensor:
+        """Sum over a pose's corrections [m, rad] of squares, mean over all poses."""
         corrections = torch.cat([self.shifts, self.yaws, self.tilts], dim=1)
         return corrections.square().sum(dim=1).mean()
 

@@ -22,8 +22,8 @@ class DirectionOptions:
     Attributes:
         lobe_prior: variance of the directions at which objects keep half of a direction-dependent
             colour; 0 keeps the learnt colours.
-        paint: whether vehicle sides that images show only edge on get the frontal colours of
-            initialisation; the colours visible in the images stay.
+        paint: whether vehicle sides that images show only edge on get the colours of their
+            bodies; the colours visible in the images stay.
         sides: whether vehicle sides that images show only edge on come from initialisation. This
             improves edits and degrades recorded views.
         close: whether vehicles that images show from one direction only are closed: the learnt

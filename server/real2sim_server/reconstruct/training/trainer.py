@@ -206,7 +206,7 @@ class Trainer:
         if weights.smooth > 0 and objects and self.options.refine_poses:
             terms["smooth"] = weights.smooth * model.poses.roughness()
         if weights.box_pose > 0 and objects and self.options.refine_poses:
-            terms["box_pose"] = weights.box_pose * model.poses.departure()
+            terms["box_pose"] = weights.box_pose * model.poses.squares()
         if weights.exposure > 0 and self.options.learning_rates.exposure > 0:
             change = model.exposure - torch.eye(3, 4, device=model.device)
             terms["exposure"] = weights.exposure * change.square().sum()

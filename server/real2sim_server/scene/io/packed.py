@@ -112,7 +112,7 @@ class _PackedDocument(_Part):
 def write_packed(scene: Scene, path: str | PathLike[str]) -> None:
     """Write ``scene`` to the file ``path`` atomically, by convention ``<name>.r2s.zip``.
 
-    LiDAR surfaces are left out: beams then meet the Gaussians of the images.
+    Leaves out LiDAR surfaces: LiDAR of the packed scene uses the Gaussians trained on images.
 
     Raises:
         SceneError: values that are not finite or out of range.

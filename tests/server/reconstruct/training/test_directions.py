@@ -127,3 +127,18 @@ def test_unseen_flanks_keep_their_seen_colour_and_get_paint_from_ahead(followed)
     from_ahead = torch.tensor([[0.0, -1, 0], [0, 1, 0]])
     shown = evaluate_sh(painted[1:3], from_ahead) + 0.5
     np.testing.assert_allclose(shown, RED.expand(2, 3), atol=0.02)
+
+
+def test_an_initial_point_in_another_colour_does_not_colour_an_unseen_flank(followed):
+    model, viewpoints, body = followed
+    car = model.scene.objects["car"]
+    sh = car.cloud.sh.clone()
+    sh[1] = (torch.tensor([0.1, 0.8, 0.1]) - 0.5) / SH_C0
+    model.scene = replace(
+        model.scene,
+        objects={"car": replace(car, cloud=replace(car.cloud, sh=sh))},
+        content_hash="",
+    )
+    paint_unseen_sides(model, viewpoints, [body])
+    from_left = evaluate_sh(model.gaussians.sh.detach()[-3:-2], torch.tensor([[0.0, -1, 0]])) + 0.5
+    np.testing.assert_allclose(from_left, RED[None], atol=0.02)

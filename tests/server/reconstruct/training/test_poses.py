@@ -49,12 +49,12 @@ def test_roll_lifts_the_left_side_and_pitch_lowers_the_front(poses: ObjectPoses)
         assert raised[2] * sign == pytest.approx(np.sin(0.1), abs=1e-3)
 
 
-def test_departure_is_the_mean_square_of_all_corrections(poses: ObjectPoses) -> None:
-    assert poses.departure().item() == 0
+def test_squares_add_up_per_pose_and_are_averaged(poses: ObjectPoses) -> None:
+    assert poses.squares().item() == 0
     with torch.no_grad():
         poses.shifts[:, 1], poses.yaws[::2], poses.tilts[:, 0] = 0.3, 0.2, 0.1
     share = len(poses.yaws[::2]) / len(poses.yaws)
-    assert poses.departure().item() == pytest.approx(0.09 + 0.04 * share + 0.01, rel=1e-5)
+    assert poses.squares().item() == pytest.approx(0.09 + 0.04 * share + 0.01, rel=1e-5)
 
 
 def test_every_correction_has_a_gradient(poses: ObjectPoses) -> None:
