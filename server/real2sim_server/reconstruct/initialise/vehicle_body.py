@@ -229,11 +229,10 @@ def _body(shape: VehicleShape) -> VehicleBody:
     paints: list[tuple[float, ...]] = []
     mesh = build_vehicle(shape, paints)
     triangle, weights = _spread(mesh.corners)
-    # Wheels come first: the shell behind their outer faces falls into the same cells.
-    order = np.argsort(mesh.material[triangle] != WHEEL, kind="stable")
-    triangle, weights = triangle[order], weights[order]
     points = np.einsum("nk,nkd->nd", weights, mesh.corners[triangle])
-    coarse, fine = (_one_per_cell(points, size) for size in (SPACING, FINE_SPACING))
+    # The shell behind the outer faces of wheels falls into the same cells.
+    behind = mesh.material[triangle] != WHEEL
+    coarse, fine = (_one_per_cell(points, size, behind) for size in (SPACING, FINE_SPACING))
     kept = np.concatenate([coarse, fine])
     triangle, weights, points = triangle[kept], weights[kept], points[kept]
     normals = np.einsum("nk,nkd->nd", weights, mesh.normals[triangle])
@@ -260,10 +259,18 @@ def _body(shape: VehicleShape) -> VehicleBody:
     return VehicleBody(points, normals, parts, colours[kept].astype(np.float32), drawn)
 
 
-def _one_per_cell(points: Float, spacing: float) -> NDArray[np.int64]:
-    """Indices of the first of the points [N, 3] in each cell of a grid."""
-    cells = np.floor(points / spacing).astype(np.int64)
-    return np.unique(cells, axis=0, return_index=True)[1]
+def _one_per_cell(
+    points: Float, spacing: float, behind: NDArray[np.bool_] | None = None
+) -> NDArray[np.int64]:
+    """Indices of the points [N, 3] nearest to the middle of each cell of a grid, which spreads them
+    evenly. Points ``behind`` [N] only count in cells without others.
+    """
+    cells = np.floor(points / spacing)
+    from_middle = np.abs(points / spacing - cells - 0.5).max(axis=1)
+    behind = np.zeros(len(points), np.bool_) if behind is None else behind
+    order = np.lexsort((from_middle, behind))
+    first = np.unique(cells[order].astype(np.int64), axis=0, return_index=True)[1]
+    return np.asarray(order[first])
 
 
 def _at_borders(points: Float, unit: Float, parts: NDArray[np.uint8]) -> NDArray[np.bool_]:
@@ -301,14 +308,9 @@ def _drawn_spacing(points: Float, unit: Float, parts: NDArray[np.uint8]) -> NDAr
     plain = np.ones(len(points), dtype=np.bool_)
     plain[near[unlike].ravel()] = False
     plain |= unit[:, 2] < FACING_DOWN
-    cells = np.floor(points[plain] / WIDE_SPACING)
-    from_centre = np.abs(points[plain] / WIDE_SPACING - cells - 0.5).max(axis=1)
-    # Use the point nearest to the middle of each cell, for a uniform spacing.
-    order = np.argsort(from_centre, kind="stable")
-    kept = order[_one_per_cell(points[plain][order], WIDE_SPACING)]
     drawn = np.full(len(points), SPACING, dtype=np.float32)
     drawn[plain] = 0
-    drawn[np.flatnonzero(plain)[kept]] = WIDE_SPACING
+    drawn[np.flatnonzero(plain)[_one_per_cell(points[plain], WIDE_SPACING)]] = WIDE_SPACING
     return drawn
 
 

@@ -20,7 +20,7 @@ from torch.nn.functional import normalize
 from ...geometry import matrix_to_quaternion
 from ...scene import GaussianCloud, Scene, SceneObject
 from ...scene.cloud import SH_C0
-from ..initialise.vehicle_body import SPACING, VehicleBody, body_colours
+from ..initialise.vehicle_body import SPACING, WIDE_SPACING, VehicleBody, body_colours
 from . import kernels
 from .densify import SelectiveAdam, rotation_matrices
 from .gaussians import FIELDS, OBJECT_FIELDS
@@ -43,9 +43,10 @@ SHADOW = 0.3
 INSETS = (1.0, 0.96, 0.92, 0.87, 0.82)
 """Factors by which a body may be narrower and lower where images show it beyond the vehicle's
 outline."""
-DISC, BENT = (0.7, 0.7, 0.15), (0.5, 0.5, 0.15)
-"""Standard deviation of a body's Gaussians relative to their spacing, on flat and bent surfaces.
-Larger ones at bends reach beyond the outline."""
+DISC, BENT = (0.55, 0.55, 0.15), (0.45, 0.45, 0.15)
+"""Standard deviation of a body's Gaussians relative to their spacing, on flat surfaces and at bends
+and borders. Larger ones reach beyond the outline, and nearer parts cover the edge of farther ones.
+"""
 
 
 @torch.no_grad()
@@ -107,7 +108,7 @@ def body_cloud(
     """
     drawn = body.drawn > 0
     spacing = body.drawn[drawn, None]
-    scales = spacing * np.where(spacing == SPACING, BENT, DISC).astype(np.float32)
+    scales = spacing * np.where(spacing < WIDE_SPACING, BENT, DISC).astype(np.float32)
     colours = body_colours(body, item, scene)[drawn]
     factors = np.array([(1 - 0.4 * (1 - f), f, f) for f in insets])
     normals = body.unit_normals()[drawn]

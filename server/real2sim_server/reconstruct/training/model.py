@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn.functional import pad
 
 from ...geometry import (
     Float,
@@ -68,6 +69,9 @@ class ImageGains:
 # Refined object poses: small corrections of the tracked boxes at the training frames.
 
 
+UNREFINED = -1
+
+
 @dataclass(frozen=True, eq=False)
 class KeyPoses:
     """Corrections of one object, about its own axes.
@@ -75,18 +79,13 @@ class KeyPoses:
     Attributes:
         times_us: [T] int64 key times [us].
         positions, quaternions: [T, 3] and [T, 4] float64 of the input boxes.
-        first_row: first row of this object in the packed corrections.
+        rows: [T] rows of the packed corrections; UNREFINED for an object that stands still.
     """
 
     times_us: NDArray[np.int64]
     positions: Float
     quaternions: Float
-    first_row: int
-
-    @property
-    def rows(self) -> slice:
-        """Rows of the packed corrections."""
-        return slice(self.first_row, self.first_row + len(self.times_us))
+    rows: NDArray[np.int64]
 
     def covers(self, t_us: int) -> bool:
         """Whether the object exists at ``t_us``."""
@@ -108,7 +107,7 @@ class ObjectPoses:
     At a key time ``T_world_object = T_given [Rz(yaw) Ry(pitch) Rx(roll) | shift]``. In between,
     positions and corrections are linear and rotations slerped, as in Trajectory. Roll and pitch are
     needed because boxes are mostly labelled upright, while roads are steep and vehicles pitch when
-    they brake.
+    they brake. Objects that stand still have none: moving their Gaussians has the same effect.
 
     Args:
         scene: its trajectories are the initial poses.
@@ -126,18 +125,23 @@ class ObjectPoses:
         device: torch.device | str = "cpu",
     ) -> None:
         self.keys: list[KeyPoses] = []
-        row = 0
+        levers: list[tuple[float, float, float]] = []
         for item in scene.objects.values():
             times = _key_times(item.trajectory, key_times_us)
             poses = [item.trajectory.pose(int(t)) for t in times]
             positions, quaternions = (np.array(part) for part in zip(*poses, strict=True))
-            key = KeyPoses(times, positions, quaternions, row)
-            self.keys.append(key)
-            row += len(times)
+            rows = np.full(len(times), UNREFINED)
+            if not _stands_still(item.trajectory):
+                rows = len(levers) + np.arange(len(times))
+                length, width, _ = item.size
+                levers += [(width / 2, length / 2, length / 2)] * len(times)
+            self.keys.append(KeyPoses(times, positions, quaternions, rows))
         self._given = [Trajectory(k.times_us, k.positions, k.quaternions) for k in self.keys]
-        self.shifts = torch.zeros(row, 3, device=device, requires_grad=True)
-        self.yaws = torch.zeros(row, 1, device=device, requires_grad=True)
-        self.tilts = torch.zeros(row, 2, device=device, requires_grad=True)
+        count = len(levers)
+        self.shifts = torch.zeros(count, 3, device=device, requires_grad=True)
+        self.yaws = torch.zeros(count, 1, device=device, requires_grad=True)
+        self.tilts = torch.zeros(count, 2, device=device, requires_grad=True)
+        self._levers = torch.tensor(levers, device=device).reshape(-1, 3)
 
     def at(self, t_us: int) -> tuple[list[int], Tensor]:
         """Indices of the K objects that exist at ``t_us``, and their ``T_world_object`` [K, 4, 4]
@@ -148,14 +152,17 @@ class ObjectPoses:
             return [], torch.zeros(0, 4, 4, dtype=torch.float64, device=self.shifts.device)
         keys = [self.keys[index] for index in present]
         before, after, fractions = zip(*(key.bracket(t_us) for key in keys), strict=True)
-        first = np.array([key.first_row for key in keys])
         device = self.shifts.device
-        rows = [torch.from_numpy(first + key).to(device) for key in (before, after)]
+        rows = [
+            torch.tensor([k.rows[i] for k, i in zip(keys, at, strict=True)], device=device)
+            for at in (before, after)
+        ]
         later = torch.tensor(fractions, dtype=torch.float64, device=device)[:, None]
         weights = (1 - later).float(), later.float()
         shift, yaw, tilt = (
             held[rows[0]] * weights[0] + held[rows[1]] * weights[1]
-            for held in (self.shifts, self.yaws, self.tilts)
+            # The last row serves objects that stand still.
+            for held in (pad(t, (0, 0, 0, 1)) for t in (self.shifts, self.yaws, self.tilts))
         )
         poses = [self._given[index].pose(t_us) for index in present]
         given = transform_from(*(np.array(part) for part in zip(*poses, strict=True)))
@@ -169,14 +176,17 @@ class ObjectPoses:
                 torch.cat(self._refined(key), dim=1), (key.times_us * 1e-6).astype(np.float64)
             )
             for key in self.keys
-            if len(key.times_us) >= 3
+            if len(key.times_us) >= 3 and key.rows[0] != UNREFINED
         ]
         return torch.stack(terms).mean() if terms else self.shifts.sum() * 0
 
     def squares(self) -> Tensor:
-        """Sum over a pose's corrections [m, rad] of squares, mean over all poses."""
-        corrections = torch.cat([self.shifts, self.yaws, self.tilts], dim=1)
-        return corrections.square().sum(dim=1).mean()
+        """Squared corrections [m^2], mean over all poses; those of angles are the squared distances
+        by which they move the ends of a box.
+        """
+        turns = torch.cat([self.tilts, self.yaws], dim=1) * self._levers
+        total = self.shifts.square().sum() + turns.square().sum()
+        return total / max(sum(len(key.times_us) for key in self.keys), 1)
 
     def _refined(self, key: KeyPoses) -> tuple[Tensor, Tensor, Tensor]:
         """World positions [T, 3] about their mean, unwrapped yaws [T, 1] and corrections of roll
@@ -194,6 +204,8 @@ class ObjectPoses:
     def trajectory(self, index: int) -> Trajectory:
         """The refined trajectory of object ``index``."""
         key = self.keys[index]
+        if key.rows[0] == UNREFINED:
+            return self._given[index]
         shift = self.shifts.detach()[key.rows].cpu().double().numpy()
         yaw = self.yaws.detach()[key.rows, 0].cpu().double().numpy()
         roll, pitch = self.tilts.detach()[key.rows].cpu().double().numpy().T
@@ -225,6 +237,11 @@ def _about(axis: int, angle: NDArray[np.float64]) -> NDArray[np.float64]:
     quaternions = np.zeros((len(angle), 4))
     quaternions[:, 0], quaternions[:, 1 + axis] = np.cos(angle / 2), np.sin(angle / 2)
     return quaternions
+
+
+def _stands_still(trajectory: Trajectory) -> bool:
+    poses = np.concatenate([trajectory.positions, trajectory.quaternions], axis=1)
+    return not np.ptp(poses, axis=0).any()
 
 
 def _key_times(trajectory: Trajectory, key_times_us: NDArray[np.int64] | None) -> NDArray[np.int64]:
@@ -330,8 +347,7 @@ class SceneModel:
         self.poses.yaws = packing.leaf(tensors["pose_yaw"], self.device)
         self.poses.tilts = packing.leaf(tensors["pose_tilt"], self.device)
         self.exposure = packing.leaf(tensors["exposure"], self.device)
-        if "image_exposure" in tensors:
-            self.gains.logarithms = packing.leaf(tensors["image_exposure"], self.device)
+        self.gains.logarithms = packing.leaf(tensors["image_exposure"], self.device)
         self.cameras = packing.leaf(tensors["camera"], self.device)
 
     def render(

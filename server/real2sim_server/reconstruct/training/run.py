@@ -63,6 +63,10 @@ ACCELERATION, YAW_ACCELERATION = 2.0, 0.6
 MIN_NOISE, MIN_YAW_NOISE = 0.02, 0.005
 """Minimum noise for smoothing boxes [m], [rad]."""
 MIN_POSES = 5
+STANDING = 0.03, 0.01
+"""Maximum scatter of the boxes of a standing object without noise [m], [rad]."""
+STANDING_NOISE = 1.5
+"""Maximum scatter of the boxes of a standing object, relative to their noise."""
 
 
 def with_box_noise(log: DrivingLog, fraction: float, *, seed: int = 0) -> DrivingLog:
@@ -75,13 +79,16 @@ def with_box_noise(log: DrivingLog, fraction: float, *, seed: int = 0) -> Drivin
     tracks = []
     for index, track in enumerate(log.tracks):
         rng = np.random.default_rng([seed, index])
-        given = track.trajectory
-        count = len(given.times_us)
+        given, frames = track.trajectory, log.frame_times_us
+        within = frames[(frames > given.start_us) & (frames < given.end_us)]
+        times = np.union1d(given.times_us, within)
+        given = Trajectory(times, *map(np.array, zip(*map(given.pose, times), strict=True)))
+        count = len(times)
         shift = rng.standard_normal((count, 3)) * (fraction * np.array(track.size))
         rotations = quaternion_to_matrix(given.quaternions)
         tracks.append(
             _with_poses(
-                track,
+                replace(track, trajectory=given),
                 given.positions + np.einsum("tij,tj->ti", rotations, shift),
                 rng.standard_normal(count) * fraction,
             )
@@ -92,9 +99,10 @@ def with_box_noise(log: DrivingLog, fraction: float, *, seed: int = 0) -> Drivin
 def smoothed_boxes(log: DrivingLog) -> DrivingLog:
     """``log`` with box noise smoothed to feasible vehicle motion.
 
-    The variance of second differences measures the noise. If it exceeds normal driving, positions
-    and headings are smoothed with the weight that follows from both (Whittaker 1923). Boxes without
-    noise stay bit-identical.
+    The variance of second differences measures the noise. Objects whose boxes scatter little more
+    than that stand still, in the median pose. Otherwise, if the noise exceeds normal driving,
+    positions and headings are smoothed with the weight that follows from both (Whittaker 1923).
+    Boxes of moving objects without noise stay bit-identical.
     """
     return replace(log, tracks=tuple(_smoothed(track) for track in log.tracks))
 
@@ -105,11 +113,34 @@ def _smoothed(track: ObjectTrack) -> ObjectTrack:
         return track
     step = float(np.median(np.diff(given.times_us))) * 1e-6
     heading = np.unwrap(quaternion_yaw(given.quaternions))
+    if all(
+        _stands(values, least)
+        for values, least in zip((given.positions, heading[:, None]), STANDING, strict=True)
+    ):
+        usual = int(np.argmin(np.abs(heading - np.median(heading))))
+        poses = np.median(given.positions, axis=0), given.quaternions[usual]
+        still = (np.tile(pose, (len(heading), 1)) for pose in poses)
+        return replace(track, trajectory=Trajectory(given.times_us, *still))
     smooth = _whittaker(given.positions, ACCELERATION * step**2, MIN_NOISE)
     turned = _whittaker(heading[:, None], YAW_ACCELERATION * step**2, MIN_YAW_NOISE)[:, 0]
     if smooth is given.positions and np.array_equal(turned, heading):
         return track
     return _with_poses(track, smooth, turned - heading)
+
+
+def _stands(values: Float, least: float) -> bool:
+    """Whether ``values`` [T, D] scatter little more than their noise, or by less than ``least``."""
+    scatter = np.sqrt(values.var(axis=0).sum())
+    return bool(scatter < max(least, STANDING_NOISE * np.sqrt(_noise(values).sum() / 6)))
+
+
+def _noise(values: Float) -> Float:
+    """Variances [D] of the second differences of ``values`` [T, D], six times those of their noise.
+
+    Robust to the few steps with hard braking.
+    """
+    second = np.diff(values, n=2, axis=0)
+    return np.asarray((1.4826 * np.median(np.abs(second), axis=0)) ** 2)
 
 
 def _whittaker(values: Float, driving: float, least: float) -> Float:
@@ -118,10 +149,7 @@ def _whittaker(values: Float, driving: float, least: float) -> Float:
     Args:
         driving: standard deviation of second differences without noise.
     """
-    second = np.diff(values, n=2, axis=0)
-    # Robust to the few steps with hard braking.
-    deviation = 1.4826 * np.median(np.abs(second), axis=0)
-    variance = max(0.0, float((deviation**2).mean()) - driving**2) / 6
+    variance = max(0.0, float(_noise(values).mean()) - driving**2) / 6
     if variance < least**2:
         return values
     difference: NDArray[np.float64] = np.diff(np.eye(len(values)), n=2, axis=0)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from real2sim_server.logs import ObjectTrack
 from real2sim_server.reconstruct.training import (
     DensifyOptions,
     LearningRates,
@@ -43,6 +44,22 @@ def test_smoothing_reduces_box_noise(long_log):
     given, smooth = errors(noisy, long_log), errors(smoothed_boxes(noisy), long_log)
     assert min(given) > 0.1
     assert max(s / g for s, g in zip(smooth, given, strict=True)) < 0.5
+
+
+@pytest.mark.parametrize("speed", [0.0, 0.3])
+def test_only_objects_that_do_not_move_get_one_pose(long_log, speed):
+    log = replace(long_log, tracks=(_drifting(long_log.tracks[0], speed),))
+    [noisy] = with_box_noise(log, 0.02, seed=1).tracks
+    [smooth] = smoothed_boxes(replace(log, tracks=(noisy,))).tracks
+    poses = smooth.trajectory
+    stands = not np.ptp(np.concatenate([poses.positions, poses.quaternions], axis=1), axis=0).any()
+    assert stands == (speed == 0)
+    true = np.array([log.tracks[0].trajectory.pose(int(t))[0] for t in poses.times_us])
+    off, given = (
+        np.linalg.norm(p - true, axis=1).mean()
+        for p in (poses.positions, noisy.trajectory.positions)
+    )
+    assert off < 0.6 * given
 
 
 def test_box_noise_depends_only_on_the_seed(long_log):
@@ -93,6 +110,15 @@ def _nearness(log, item: SceneObject) -> float:
     ego = log.ego.transform(t_us)
     local = ego[:3, :3].T @ (item.trajectory.pose(t_us)[0] - ego[:3, 3])
     return 1 / local[0] if local[0] > 4 and abs(local[1]) < 0.5 * local[0] else 0.0
+
+
+def _drifting(track: ObjectTrack, speed: float) -> ObjectTrack:
+    """``track`` at its first pose, moved along y at ``speed`` [m/s]; two poses."""
+    given = track.trajectory
+    times = np.array([given.start_us, given.end_us])
+    gone = np.array([[0, 0, 0], [0, speed * np.ptp(times) * 1e-6, 0]])
+    poses = Trajectory(times, given.positions[0] + gone, np.tile(given.quaternions[0], (2, 1)))
+    return replace(track, trajectory=poses)
 
 
 def _shifted(scene: Scene, name: str, left: float) -> Scene:

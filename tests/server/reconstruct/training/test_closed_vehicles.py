@@ -14,7 +14,7 @@ from real2sim_server.reconstruct.training.closed_vehicles import (
     close_followed,
     offer_bodies,
 )
-from real2sim_server.reconstruct.training.densify import SelectiveAdam
+from real2sim_server.reconstruct.training.densify import SelectiveAdam, rotation_matrices
 from real2sim_server.scene import GaussianCloud, SceneObject, Trajectory
 from real2sim_server.scene.cloud import SH_C0
 
@@ -146,3 +146,14 @@ def test_a_followed_vehicle_is_offered_a_painted_body_at_every_inset(tiny_scene,
     assert (offered.alternatives[: len(model.scene.background)] < 0).all()
     seen_round = offer_bodies(model, [False], [body])
     assert len(seen_round.scene.objects["car"].cloud) == count
+
+
+def test_bodies_hardly_reach_beyond_their_boxes(tiny_scene, ahead, body):
+    camera, t_us, pose = ahead
+    model = model_of(tiny_scene, pose, deep_tail(body, camera, tiny_scene, t_us, pose))
+    cloud = offer_bodies(model, [False], [body]).scene.objects["car"].cloud
+    axes = rotation_matrices(cloud.quats) * cloud.scales[:, None]
+    # The distance at which a Gaussian is half transparent.
+    spread = 1.18 * axes.square().sum(-1).sqrt()
+    over = (cloud.means.abs() + spread).amax(0) - torch.tensor(model.scene.objects["car"].size) / 2
+    assert over.max() < 0.05
