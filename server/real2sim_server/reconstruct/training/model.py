@@ -70,6 +70,7 @@ class ImageGains:
 
 
 UNREFINED = -1
+"""Row of objects that stand still: the last one, which is zero."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,14 +155,13 @@ class ObjectPoses:
         before, after, fractions = zip(*(key.bracket(t_us) for key in keys), strict=True)
         device = self.shifts.device
         rows = [
-            torch.tensor([k.rows[i] for k, i in zip(keys, at, strict=True)], device=device)
-            for at in (before, after)
+            torch.tensor([key.rows[i] for key, i in zip(keys, found, strict=True)], device=device)
+            for found in (before, after)
         ]
         later = torch.tensor(fractions, dtype=torch.float64, device=device)[:, None]
         weights = (1 - later).float(), later.float()
         shift, yaw, tilt = (
             held[rows[0]] * weights[0] + held[rows[1]] * weights[1]
-            # The last row serves objects that stand still.
             for held in (pad(t, (0, 0, 0, 1)) for t in (self.shifts, self.yaws, self.tilts))
         )
         poses = [self._given[index].pose(t_us) for index in present]

@@ -99,8 +99,8 @@ def with_box_noise(log: DrivingLog, fraction: float, *, seed: int = 0) -> Drivin
 def smoothed_boxes(log: DrivingLog) -> DrivingLog:
     """``log`` with box noise smoothed to feasible vehicle motion.
 
-    The variance of second differences measures the noise. Objects whose boxes scatter little more
-    than that stand still, in the median pose. Otherwise, if the noise exceeds normal driving,
+    Second differences measure the noise. Objects whose boxes scatter little more than that stand
+    still: they get their median pose. For others with more noise than normal driving explains,
     positions and headings are smoothed with the weight that follows from both (Whittaker 1923).
     Boxes of moving objects without noise stay bit-identical.
     """
@@ -131,16 +131,16 @@ def _smoothed(track: ObjectTrack) -> ObjectTrack:
 def _stands(values: Float, least: float) -> bool:
     """Whether ``values`` [T, D] scatter little more than their noise, or by less than ``least``."""
     scatter = np.sqrt(values.var(axis=0).sum())
-    return bool(scatter < max(least, STANDING_NOISE * np.sqrt(_noise(values).sum() / 6)))
+    return bool(scatter < max(least, STANDING_NOISE * np.sqrt(_noise(values).sum())))
 
 
 def _noise(values: Float) -> Float:
-    """Variances [D] of the second differences of ``values`` [T, D], six times those of their noise.
+    """Variances [D] of the noise of ``values`` [T, D], from their second differences.
 
     Robust to the few steps with hard braking.
     """
     second = np.diff(values, n=2, axis=0)
-    return np.asarray((1.4826 * np.median(np.abs(second), axis=0)) ** 2)
+    return np.asarray((1.4826 * np.median(np.abs(second), axis=0)) ** 2 / 6)
 
 
 def _whittaker(values: Float, driving: float, least: float) -> Float:
@@ -149,7 +149,7 @@ def _whittaker(values: Float, driving: float, least: float) -> Float:
     Args:
         driving: standard deviation of second differences without noise.
     """
-    variance = max(0.0, float(_noise(values).mean()) - driving**2) / 6
+    variance = max(0.0, float(_noise(values).mean()) - driving**2 / 6)
     if variance < least**2:
         return values
     difference: NDArray[np.float64] = np.diff(np.eye(len(values)), n=2, axis=0)
