@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -182,9 +183,17 @@ class Trajectory:
             )
         first, last = max(start_us, self.start_us), min(end_us, self.end_us)
         inside = self.times_us[(self.times_us > first) & (self.times_us < last)]
-        times_us = np.unique([first, *inside.tolist(), last])
-        positions, quaternions = zip(*(self.pose(int(t_us)) for t_us in times_us), strict=True)
-        return Trajectory(times_us, np.array(positions), np.array(quaternions))
+        return self._at([first, *inside.tolist(), last])
+
+    def sampled(self, times_us: NDArray[np.int64]) -> Trajectory:
+        """Its poses at its ends, and in between at ``times_us`` [K]."""
+        inside = times_us[(times_us > self.start_us) & (times_us < self.end_us)]
+        return self._at([self.start_us, *inside.tolist(), self.end_us])
+
+    def _at(self, times_us: Sequence[int]) -> Trajectory:
+        times = np.unique(times_us)
+        positions, quaternions = zip(*(self.pose(int(t_us)) for t_us in times), strict=True)
+        return Trajectory(times, np.array(positions), np.array(quaternions))
 
     def moved(self, T_new_fixed: ArrayLike) -> Trajectory:
         """The same motion in another fixed frame, by ``T_new_fixed`` [4, 4]."""

@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn.functional import pad
 
 from ...geometry import (
     Float,
@@ -69,10 +68,6 @@ class ImageGains:
 # Refined object poses: small corrections of the tracked boxes at the training frames.
 
 
-UNREFINED = -1
-"""Row of objects that stand still: the last one, which is zero."""
-
-
 @dataclass(frozen=True, eq=False)
 class KeyPoses:
     """Corrections of one object, about its own axes.
@@ -80,13 +75,18 @@ class KeyPoses:
     Attributes:
         times_us: [T] int64 key times [us].
         positions, quaternions: [T, 3] and [T, 4] float64 of the input boxes.
-        rows: [T] rows of the packed corrections; UNREFINED for an object that stands still.
+        first_row: first row of this object in the packed corrections.
     """
 
     times_us: NDArray[np.int64]
     positions: Float
     quaternions: Float
-    rows: NDArray[np.int64]
+    first_row: int
+
+    @property
+    def rows(self) -> slice:
+        """Rows of the packed corrections."""
+        return slice(self.first_row, self.first_row + len(self.times_us))
 
     def covers(self, t_us: int) -> bool:
         """Whether the object exists at ``t_us``."""
@@ -126,23 +126,30 @@ class ObjectPoses:
         device: torch.device | str = "cpu",
     ) -> None:
         self.keys: list[KeyPoses] = []
+        self._given: list[Trajectory] = []
         levers: list[tuple[float, float, float]] = []
+        moving: list[bool] = []
         for item in scene.objects.values():
-            times = _key_times(item.trajectory, key_times_us)
-            poses = [item.trajectory.pose(int(t)) for t in times]
-            positions, quaternions = (np.array(part) for part in zip(*poses, strict=True))
-            rows = np.full(len(times), UNREFINED)
-            if not _stands_still(item.trajectory):
-                rows = len(levers) + np.arange(len(times))
-                length, width, _ = item.size
-                levers += [(width / 2, length / 2, length / 2)] * len(times)
-            self.keys.append(KeyPoses(times, positions, quaternions, rows))
-        self._given = [Trajectory(k.times_us, k.positions, k.quaternions) for k in self.keys]
-        count = len(levers)
-        self.shifts = torch.zeros(count, 3, device=device, requires_grad=True)
-        self.yaws = torch.zeros(count, 1, device=device, requires_grad=True)
-        self.tilts = torch.zeros(count, 2, device=device, requires_grad=True)
+            given = item.trajectory
+            if key_times_us is not None:
+                given = given.sampled(key_times_us)
+            key = KeyPoses(given.times_us, given.positions, given.quaternions, len(levers))
+            self.keys.append(key)
+            self._given.append(given)
+            length, width, _ = item.size
+            levers += [(width / 2, length / 2, length / 2)] * len(given.times_us)
+            moving += [given.extent > 0] * len(given.times_us)
+        rows = len(levers)
+        self.shifts = torch.zeros(rows, 3, device=device, requires_grad=True)
+        self.yaws = torch.zeros(rows, 1, device=device, requires_grad=True)
+        self.tilts = torch.zeros(rows, 2, device=device, requires_grad=True)
         self._levers = torch.tensor(levers, device=device).reshape(-1, 3)
+        self._moving = torch.tensor(moving, dtype=torch.float32, device=device)[:, None]
+
+    def _applied(self) -> tuple[Tensor, Tensor]:
+        """Shifts [R, 3] and roll, pitch and yaw [R, 3]; 0 for objects that stand still."""
+        angles = torch.cat([self.tilts, self.yaws], dim=1)
+        return self.shifts * self._moving, angles * self._moving
 
     def at(self, t_us: int) -> tuple[list[int], Tensor]:
         """Indices of the K objects that exist at ``t_us``, and their ``T_world_object`` [K, 4, 4]
@@ -153,20 +160,17 @@ class ObjectPoses:
             return [], torch.zeros(0, 4, 4, dtype=torch.float64, device=self.shifts.device)
         keys = [self.keys[index] for index in present]
         before, after, fractions = zip(*(key.bracket(t_us) for key in keys), strict=True)
+        first = np.array([key.first_row for key in keys])
         device = self.shifts.device
-        rows = [
-            torch.tensor([key.rows[i] for key, i in zip(keys, found, strict=True)], device=device)
-            for found in (before, after)
-        ]
+        rows = [torch.from_numpy(first + key).to(device) for key in (before, after)]
         later = torch.tensor(fractions, dtype=torch.float64, device=device)[:, None]
         weights = (1 - later).float(), later.float()
-        shift, yaw, tilt = (
-            held[rows[0]] * weights[0] + held[rows[1]] * weights[1]
-            for held in (pad(t, (0, 0, 0, 1)) for t in (self.shifts, self.yaws, self.tilts))
+        shift, angles = (
+            held[rows[0]] * weights[0] + held[rows[1]] * weights[1] for held in self._applied()
         )
         poses = [self._given[index].pose(t_us) for index in present]
         given = transform_from(*(np.array(part) for part in zip(*poses, strict=True)))
-        corrections = _corrections(shift.double(), torch.cat([tilt, yaw], dim=1).double())
+        corrections = _corrections(shift.double(), angles.double())
         return present, torch.from_numpy(given).to(device) @ corrections
 
     def roughness(self) -> Tensor:
@@ -176,7 +180,7 @@ class ObjectPoses:
                 torch.cat(self._refined(key), dim=1), (key.times_us * 1e-6).astype(np.float64)
             )
             for key in self.keys
-            if len(key.times_us) >= 3 and key.rows[0] != UNREFINED
+            if len(key.times_us) >= 3
         ]
         return torch.stack(terms).mean() if terms else self.shifts.sum() * 0
 
@@ -184,9 +188,9 @@ class ObjectPoses:
         """Squared corrections [m^2], mean over all poses; those of angles are the squared distances
         by which they move the ends of a box.
         """
-        turns = torch.cat([self.tilts, self.yaws], dim=1) * self._levers
-        total = self.shifts.square().sum() + turns.square().sum()
-        return total / max(sum(len(key.times_us) for key in self.keys), 1)
+        shifts, angles = self._applied()
+        moved = torch.cat([shifts, angles * self._levers], dim=1)
+        return moved.square().sum(dim=1).mean()
 
     def _refined(self, key: KeyPoses) -> tuple[Tensor, Tensor, Tensor]:
         """World positions [T, 3] about their mean, unwrapped yaws [T, 1] and corrections of roll
@@ -195,20 +199,17 @@ class ObjectPoses:
         rotations = quaternion_to_matrix(key.quaternions).astype(np.float32)
         turns = torch.from_numpy(rotations).to(device)
         base = torch.from_numpy(key.positions - key.positions.mean(0)).float().to(device)
-        positions = base + torch.einsum("tij,tj->ti", turns, self.shifts[key.rows])
+        shifts, angles = (held[key.rows] for held in self._applied())
+        positions = base + torch.einsum("tij,tj->ti", turns, shifts)
         heading = np.unwrap(np.arctan2(rotations[:, 1, 0], rotations[:, 0, 0]))
         given = torch.from_numpy(heading.astype(np.float32)).to(device)
-        yaws = given[:, None] + self.yaws[key.rows]
-        return positions, yaws, self.tilts[key.rows]
+        return positions, given[:, None] + angles[:, 2:], angles[:, :2]
 
     def trajectory(self, index: int) -> Trajectory:
         """The refined trajectory of object ``index``."""
         key = self.keys[index]
-        if key.rows[0] == UNREFINED:
-            return self._given[index]
-        shift = self.shifts.detach()[key.rows].cpu().double().numpy()
-        yaw = self.yaws.detach()[key.rows, 0].cpu().double().numpy()
-        roll, pitch = self.tilts.detach()[key.rows].cpu().double().numpy().T
+        shift, angles = (held.detach()[key.rows].cpu().double().numpy() for held in self._applied())
+        roll, pitch, yaw = angles.T
         rotations = quaternion_to_matrix(key.quaternions)
         positions = key.positions + np.einsum("tij,tj->ti", rotations, shift)
         quaternions = multiply_quaternions(key.quaternions, yaw_quaternion(yaw))
@@ -237,19 +238,6 @@ def _about(axis: int, angle: NDArray[np.float64]) -> NDArray[np.float64]:
     quaternions = np.zeros((len(angle), 4))
     quaternions[:, 0], quaternions[:, 1 + axis] = np.cos(angle / 2), np.sin(angle / 2)
     return quaternions
-
-
-def _stands_still(trajectory: Trajectory) -> bool:
-    poses = np.concatenate([trajectory.positions, trajectory.quaternions], axis=1)
-    return not np.ptp(poses, axis=0).any()
-
-
-def _key_times(trajectory: Trajectory, key_times_us: NDArray[np.int64] | None) -> NDArray[np.int64]:
-    if key_times_us is None:
-        return trajectory.times_us
-    inside = key_times_us[(key_times_us > trajectory.start_us) & (key_times_us < trajectory.end_us)]
-    ends = np.array([trajectory.start_us, trajectory.end_us], dtype=np.int64)
-    return np.unique(np.concatenate([ends, inside]))
 
 
 # The model: all trainable parameters, rendered for any logged view.
@@ -347,7 +335,8 @@ class SceneModel:
         self.poses.yaws = packing.leaf(tensors["pose_yaw"], self.device)
         self.poses.tilts = packing.leaf(tensors["pose_tilt"], self.device)
         self.exposure = packing.leaf(tensors["exposure"], self.device)
-        self.gains.logarithms = packing.leaf(tensors["image_exposure"], self.device)
+        if "image_exposure" in tensors:
+            self.gains.logarithms = packing.leaf(tensors["image_exposure"], self.device)
         self.cameras = packing.leaf(tensors["camera"], self.device)
 
     def render(

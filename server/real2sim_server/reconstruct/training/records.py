@@ -20,8 +20,18 @@ from .losses import psnr_of
 # Checkpoints, bit-exact.
 
 FORMAT = "real2sim-training"
-VERSION = 5
+VERSION = 4
 STATE_FILE, TENSOR_FILE = "state.json", "state.safetensors"
+KEYS_OF_VERSION_3 = {
+    "guess_counts": "prior_counts",
+    "guess_round": "prior_round",
+    "rates": "learning_rates",
+    "share": "fraction",
+    "buried_share": "occluded_fraction",
+    "buried_depth": "occluded_depth",
+}
+PRIORS_OF_VERSION_3 = "guesses."
+"""Prefix of the tensors of priors in checkpoints of version 3."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,13 +87,39 @@ def read_checkpoint(folder: Path) -> Checkpoint:
         raise ReconstructError(f"{folder}: no checkpoint of a training run") from error
     except (ValueError, OSError, SafetensorError) as error:
         raise ReconstructError(f"{folder}: damaged checkpoint: {error}") from error
+    if state.get("format") == FORMAT and state.get("version") == 3:
+        state, tensors = _upgraded(state), {_upgraded_name(k): t for k, t in tensors.items()}
     if state.pop("format", None) != FORMAT or state.pop("version", None) != VERSION:
         raise ReconstructError(
             f"{path}: not a checkpoint of version {VERSION} of {FORMAT}; train from the start"
         )
     for name in ("counts", "prior_counts"):
         state[name] = tuple(state[name])
-    return Checkpoint(**state, tensors=tensors)
+    return Checkpoint(**state, tensors=_with_tilts(tensors))
+
+
+def _upgraded(values: Any) -> Any:
+    """Rename JSON values of version 3 to the names of VERSION."""
+    if not isinstance(values, dict):
+        return values
+    renamed = {KEYS_OF_VERSION_3.get(key, key): _upgraded(v) for key, v in values.items()}
+    return renamed | ({"version": VERSION} if "version" in renamed else {})
+
+
+def _with_tilts(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Zero roll and pitch, for checkpoints of older releases without them."""
+    added = {}
+    for name, yaws in tensors.items():
+        group, _, key = name.rpartition(".")
+        if key == "pose_yaw" and f"{group}.pose_tilt" not in tensors:
+            added[f"{group}.pose_tilt"] = yaws.new_zeros(len(yaws), 2)
+    return tensors | added
+
+
+def _upgraded_name(tensor: str) -> str:
+    if tensor.startswith(PRIORS_OF_VERSION_3):
+        return "priors." + tensor.removeprefix(PRIORS_OF_VERSION_3)
+    return tensor
 
 
 # Metrics, one JSON object per line.

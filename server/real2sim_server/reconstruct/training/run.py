@@ -61,11 +61,9 @@ def one_torch_thread() -> Iterator[None]:
 ACCELERATION, YAW_ACCELERATION = 2.0, 0.6
 """Motion priors of vehicles: standard deviations [m/s^2] and [rad/s^2]."""
 MIN_NOISE, MIN_YAW_NOISE = 0.02, 0.005
-"""Minimum noise for smoothing boxes [m], [rad]."""
+"""Noise below which boxes count as exact [m], [rad]."""
 MIN_POSES = 5
-STANDING = 0.03, 0.01
-"""Maximum scatter of the boxes of a standing object without noise [m], [rad]."""
-STANDING_NOISE = 1.5
+STANDING = 1.5
 """Maximum scatter of the boxes of a standing object, relative to their noise."""
 
 
@@ -79,11 +77,8 @@ def with_box_noise(log: DrivingLog, fraction: float, *, seed: int = 0) -> Drivin
     tracks = []
     for index, track in enumerate(log.tracks):
         rng = np.random.default_rng([seed, index])
-        given, frames = track.trajectory, log.frame_times_us
-        within = frames[(frames > given.start_us) & (frames < given.end_us)]
-        times = np.union1d(given.times_us, within)
-        given = Trajectory(times, *map(np.array, zip(*map(given.pose, times), strict=True)))
-        count = len(times)
+        given = track.trajectory.sampled(log.frame_times_us)
+        count = len(given.times_us)
         shift = rng.standard_normal((count, 3)) * (fraction * np.array(track.size))
         rotations = quaternion_to_matrix(given.quaternions)
         tracks.append(
@@ -113,14 +108,11 @@ def _smoothed(track: ObjectTrack) -> ObjectTrack:
         return track
     step = float(np.median(np.diff(given.times_us))) * 1e-6
     heading = np.unwrap(quaternion_yaw(given.quaternions))
-    if all(
-        _stands(values, least)
-        for values, least in zip((given.positions, heading[:, None]), STANDING, strict=True)
-    ):
+    if _stands(given.positions, MIN_NOISE) and _stands(heading[:, None], MIN_YAW_NOISE):
         usual = int(np.argmin(np.abs(heading - np.median(heading))))
         poses = np.median(given.positions, axis=0), given.quaternions[usual]
-        still = (np.tile(pose, (len(heading), 1)) for pose in poses)
-        return replace(track, trajectory=Trajectory(given.times_us, *still))
+        ends = (np.tile(pose, (2, 1)) for pose in poses)
+        return replace(track, trajectory=Trajectory(given.times_us[[0, -1]], *ends))
     smooth = _whittaker(given.positions, ACCELERATION * step**2, MIN_NOISE)
     turned = _whittaker(heading[:, None], YAW_ACCELERATION * step**2, MIN_YAW_NOISE)[:, 0]
     if smooth is given.positions and np.array_equal(turned, heading):
@@ -129,9 +121,9 @@ def _smoothed(track: ObjectTrack) -> ObjectTrack:
 
 
 def _stands(values: Float, least: float) -> bool:
-    """Whether ``values`` [T, D] scatter little more than their noise, or by less than ``least``."""
+    """Whether ``values`` [T, D] scatter little more than their noise, at least ``least``."""
     scatter = np.sqrt(values.var(axis=0).sum())
-    return bool(scatter < max(least, STANDING_NOISE * np.sqrt(_noise(values).sum())))
+    return bool(scatter < STANDING * max(least, np.sqrt(_noise(values).sum())))
 
 
 def _noise(values: Float) -> Float:

@@ -5,10 +5,12 @@ from dataclasses import asdict, replace
 
 import pytest
 import torch
+from safetensors.torch import load_file, save_file
 
 from real2sim_server.reconstruct import ReconstructError
 from real2sim_server.reconstruct.training.records import (
     STATE_FILE,
+    TENSOR_FILE,
     Checkpoint,
     read_checkpoint,
     write_checkpoint,
@@ -42,10 +44,38 @@ def test_a_checkpoint_round_trips(tmp_path):
     check_same(read_checkpoint(tmp_path / "checkpoint"), CHECKPOINT)
 
 
+def test_version_3_is_read_with_current_names(tmp_path):
+    folder = tmp_path / "checkpoint"
+    write_checkpoint(CHECKPOINT, folder)
+    text = json.dumps(json.loads((folder / STATE_FILE).read_text()) | {"version": 3})
+    for new, old in (
+        ("prior_counts", "guess_counts"),
+        ("prior_round", "guess_round"),
+        ("learning_rates", "rates"),
+        ("occluded_fraction", "buried_share"),
+        ("occluded_depth", "buried_depth"),
+        ("fraction", "share"),
+    ):
+        text = text.replace(f'"{new}"', f'"{old}"')
+    (folder / STATE_FILE).write_text(text)
+    tensors = load_file(folder / TENSOR_FILE)
+    tensors["guesses.means"] = tensors.pop("priors.means")
+    save_file(tensors, folder / TENSOR_FILE)
+    check_same(read_checkpoint(folder), CHECKPOINT)
+
+
+def test_older_checkpoints_have_no_box_tilt(tmp_path):
+    yaws = {f"{group}.pose_yaw": torch.ones(4, 1) for group in ("model", "adam.first")}
+    write_checkpoint(replace(CHECKPOINT, tensors=yaws), tmp_path / "checkpoint")
+    read = read_checkpoint(tmp_path / "checkpoint").tensors
+    for group in ("model", "adam.first"):
+        assert torch.equal(read[f"{group}.pose_tilt"], torch.zeros(4, 2))
+
+
 def test_other_versions_are_refused(tmp_path):
     folder = tmp_path / "checkpoint"
     write_checkpoint(CHECKPOINT, folder)
-    state = json.loads((folder / STATE_FILE).read_text()) | {"version": 4}
+    state = json.loads((folder / STATE_FILE).read_text()) | {"version": 2}
     (folder / STATE_FILE).write_text(json.dumps(state))
     with pytest.raises(ReconstructError, match="train from the start"):
         read_checkpoint(folder)
